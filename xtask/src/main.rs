@@ -12,6 +12,8 @@ mod robots;
 mod tools;
 mod workspace;
 
+use std::process::ExitCode;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
@@ -71,10 +73,19 @@ enum Command {
     Ci,
 }
 
-fn main() -> Result<()> {
-    let cli = Cli::parse();
+fn main() -> ExitCode {
+    match run(Cli::parse().command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(command: Command) -> Result<()> {
     let workspace = Workspace::locate()?;
-    match cli.command {
+    match command {
         Command::Setup => {
             let library = mujoco::ensure(&workspace)?;
             println!("MuJoCo {}: {}", mujoco::VERSION, library.display());

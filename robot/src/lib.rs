@@ -1,1 +1,22 @@
-//! Placeholder until the crate's first commit.
+//! A robot: what its MJCF model and its `robot.toml` say, checked against each other, and its kinematics.
+//!
+//! [`Robot::load`] reads a folder of `robots/` and answers with joints, limits, gains, key nodes, contacts, a
+//! compiled MuJoCo model and [`Kinematics`]: batched forward kinematics with an analytic reverse pass.
+//! Joint counts, names, orders, gains and scales come from those files, never from code.
+//!
+//! This crate never simulates, never learns, and knows nothing of human motion, networks or the wire.
+//!
+//! Frames: x forward, y left, z up. Units: metres, radians, seconds, kilograms, newton metres.
+
+mod config;
+mod error;
+mod goal_tree;
+mod kinematics;
+mod model;
+mod robot;
+
+pub use error::RobotError;
+pub use kinematics::{FrameKinematics, Kinematics, OutputLayout, Real};
+pub use robot::{
+    Foot, GoalNode, Joint, KEY_NODE_NAMES, KEY_NODES, KeyNodeSite, LinkSphere, Robot, robot_folders,
+};

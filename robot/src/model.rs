@@ -1,0 +1,194 @@
+//! The MuJoCo model: the MJCF file with what `robot.toml` says applied on top.
+
+use std::path::Path;
+
+use mujoco_rs::prelude::*;
+use mujoco_rs::wrappers::mj_editing::{MjtLimited, PositionConfig};
+
+use crate::RobotError;
+use crate::config::{Config, FootConfig};
+
+/// Foot friction (slide, spin, roll) before any randomisation.
+const FOOT_FRICTION: [f64; 3] = [1.0, 0.005, 0.0001];
+
+/// What shapes a compiled model keeps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Shapes {
+    /// Only those that carry mass or touch: what a simulation needs.
+    Physical,
+    /// The visual ones too.
+    All,
+}
+
+/// The files a model is made from; errors name them.
+pub(crate) struct Files<'a> {
+    pub(crate) config: &'a Path,
+    pub(crate) model: &'a Path,
+}
+
+/// Compiles the MJCF: locked joints removed, joint properties, position actuators (in the order goal joints, leg
+/// joints; named like their joints), foot spheres, contact pairs and a floor added, all other contacts off.
+pub(crate) fn compile(
+    files: &Files<'_>,
+    config: &Config,
+    shapes: Shapes,
+) -> Result<MjModel, RobotError> {
+    let mut edit = Edit {
+        files,
+        spec: open(files, config)?,
+    };
+    edit.options(config);
+    edit.lock(&config.joints.locked)?;
+    edit.joints(config)?;
+    edit.disable_contacts();
+    edit.pairs(&config.contacts.pairs)?;
+    for (key, foot) in config.contacts.feet() {
+        edit.foot(key, foot)?;
+    }
+    edit.floor();
+    edit.spec
+        .compiler_mut()
+        .set_discardvisual(shapes == Shapes::Physical);
+    edit.spec
+        .compile()
+        .map_err(|error| RobotError::mujoco(files.model, error))
+}
+
+fn open(files: &Files<'_>, config: &Config) -> Result<MjSpec, RobotError> {
+    if let Some(command) = config.fetch.as_ref().filter(|_| !files.model.exists()) {
+        return Err(RobotError::NotFetched {
+            file: files.config.to_path_buf(),
+            model: files.model.to_path_buf(),
+            command: command.clone(),
+        });
+    }
+    // MuJoCo takes names as they come; here they are text.
+    std::fs::read_to_string(files.model).map_err(|source| RobotError::Read {
+        file: files.model.to_path_buf(),
+        source,
+    })?;
+    MjSpec::from_xml(files.model).map_err(|error| RobotError::mujoco(files.model, error))
+}
+
+/// Name of a foot's contact sphere in the compiled model.
+pub(crate) fn foot_geom(body: &str, index: usize) -> String {
+    format!("{body}_contact_{index}")
+}
+
+struct Edit<'a> {
+    files: &'a Files<'a>,
+    spec: MjSpec,
+}
+
+impl Edit<'_> {
+    fn missing(&self, key: &str, what: &str, name: &str) -> RobotError {
+        let expected = format!("{what} of {}", self.files.model.display());
+        RobotError::value(self.files.config, key, expected, format!("{name:?}"))
+    }
+
+    fn options(&mut self, config: &Config) {
+        let option = self.spec.option_mut();
+        option.timestep = config.control.timestep;
+        // Servo damping is stiff against the armature of small joints: integrate it implicitly.
+        option.integrator = MjtIntegrator::mjINT_IMPLICITFAST as i32;
+    }
+
+    fn lock(&mut self, joints: &[String]) -> Result<(), RobotError> {
+        for (i, name) in joints.iter().enumerate() {
+            let missing = self.missing(&format!("joints.locked[{i}]"), "a joint", name);
+            let joint = self.spec.joint_mut(name).ok_or(missing)?;
+            // SAFETY: names in `locked` are unique, so each joint is deleted once, and its handle ends here.
+            unsafe { joint.delete() }
+                .map_err(|error| RobotError::mujoco(self.files.model, error))?;
+        }
+        Ok(())
+    }
+
+    fn joints(&mut self, config: &Config) -> Result<(), RobotError> {
+        for (key, joint) in config.joints.keyed() {
+            let missing = self.missing(&format!("{key}.name"), "a joint", &joint.name);
+            let element = self.spec.joint_mut(&joint.name).ok_or(missing)?;
+            element.set_armature(joint.armature);
+            element.set_frictionloss(0.0);
+            *element.damping_mut() = Default::default();
+            element.damping_mut()[0] = joint.damping;
+
+            let actuator = self.spec.add_actuator();
+            let servo = PositionConfig {
+                kp: joint.kp,
+                kv: Some(joint.kd),
+                ..PositionConfig::default()
+            };
+            actuator
+                .set_name(&joint.name)
+                .and_then(|()| actuator.set_to_position(servo))
+                .map_err(|error| RobotError::mujoco(self.files.model, error))?;
+            actuator.set_trntype(MjtTrn::mjTRN_JOINT);
+            actuator.set_target(&joint.name);
+            actuator.set_forcelimited(MjtLimited::mjLIMITED_TRUE);
+            *actuator.forcerange_mut() = [-joint.torque_limit, joint.torque_limit];
+        }
+        Ok(())
+    }
+
+    fn disable_contacts(&mut self) {
+        for geom in self.spec.geom_iter_mut() {
+            geom.set_contype(0);
+            geom.set_conaffinity(0);
+        }
+    }
+
+    fn pairs(&mut self, pairs: &[[String; 2]]) -> Result<(), RobotError> {
+        for (i, pair) in pairs.iter().enumerate() {
+            for name in pair {
+                if self.spec.geom(name).is_none() {
+                    return Err(self.missing(&format!("contacts.pairs[{i}]"), "geoms", name));
+                }
+            }
+            let element = self.spec.add_pair();
+            element.set_geomname1(&pair[0]);
+            element.set_geomname2(&pair[1]);
+            element.set_condim(1);
+        }
+        Ok(())
+    }
+
+    fn foot(&mut self, key: &str, foot: &FootConfig) -> Result<(), RobotError> {
+        let missing = self.missing(&format!("{key}.body"), "a body", &foot.body);
+        let body = self.spec.body_mut(&foot.body).ok_or(missing)?;
+        for (i, center) in foot.centers.iter().enumerate() {
+            let geom = body.add_geom();
+            geom.set_name(&foot_geom(&foot.body, i))
+                .map_err(|error| RobotError::mujoco(self.files.model, error))?;
+            geom.set_type(MjtGeomBase::mjGEOM_SPHERE);
+            *geom.size_mut() = [foot.radius, 0.0, 0.0];
+            *geom.pos_mut() = *center;
+            geom.set_mass(0.0);
+            geom.set_group(3);
+            geom.set_contype(1);
+            geom.set_conaffinity(0);
+            geom.set_condim(3);
+            // The foot's friction counts, not the larger of foot and floor: it is what gets randomised.
+            geom.set_priority(1);
+            *geom.friction_mut() = FOOT_FRICTION;
+        }
+        Ok(())
+    }
+
+    /// Lets the world's plane carry the feet; adds one where the model has none.
+    fn floor(&mut self) {
+        let world = self.spec.world_body_mut();
+        let plane = world
+            .geom_iter_mut(false)
+            .find(|geom| geom.type_() == MjtGeomBase::mjGEOM_PLANE);
+        if let Some(plane) = plane {
+            plane.set_conaffinity(1);
+            return;
+        }
+        let plane = world.add_geom();
+        plane.set_type(MjtGeomBase::mjGEOM_PLANE);
+        *plane.size_mut() = [0.0, 0.0, 1.0];
+        plane.set_contype(0);
+        plane.set_conaffinity(1);
+    }
+}

@@ -1,0 +1,673 @@
+//! The robot: what its two files say, checked against each other.
+
+use std::path::{Path, PathBuf};
+
+use mujoco_rs::prelude::*;
+use nalgebra::{Matrix3, Vector3};
+
+use crate::config::{Config, FootConfig, JointConfig, SphereConfig, WristConfig};
+use crate::kinematics::{Attached, Kinematics};
+use crate::model::{self, Files, Shapes};
+use crate::{RobotError, goal_tree};
+
+/// Number of key nodes.
+pub const KEY_NODES: usize = 8;
+
+/// Names of the key nodes, in the order in which they stand everywhere.
+pub const KEY_NODE_NAMES: [&str; KEY_NODES] = [
+    "waist",
+    "torso",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+];
+
+/// The file in a robot's folder that describes it.
+const CONFIG_FILE: &str = "robot.toml";
+
+/// A hinge joint with its position servo: torque = kp (target − q) − kd q̇, at most `torque_limit` either way.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Joint {
+    /// Name of the joint, and of its actuator, in the model.
+    pub name: String,
+    /// Lower and upper limit, rad.
+    pub range: [f64; 2],
+    /// Stiffness of the servo, N·m/rad.
+    pub kp: f64,
+    /// Damping of the servo, N·m·s/rad.
+    pub kd: f64,
+    /// Largest torque, N·m.
+    pub torque_limit: f64,
+    /// Largest speed, rad/s.
+    pub velocity_limit: f64,
+    /// Inertia of the rotor seen at the joint, kg·m².
+    pub armature: f64,
+    /// Passive damping of the joint, N·m·s/rad.
+    pub damping: f64,
+    /// Angle in the default pose, rad.
+    pub default: f64,
+    /// Index of the angle in MuJoCo's `qpos`.
+    pub qpos_address: usize,
+    /// Index of the speed in MuJoCo's `qvel`.
+    pub dof_address: usize,
+}
+
+/// A goal joint as a node of the robot's joint graph.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GoalNode {
+    /// Index of the goal joint that carries this one; none if the base does.
+    pub parent: Option<usize>,
+    /// Origin of the joint in the frame of its parent joint (of the base without one), all joints at zero, metres.
+    pub origin_xyz: [f64; 3],
+    /// Orientation of that frame: roll, pitch, yaw about fixed axes x, y, z, rad.
+    pub origin_rpy: [f64; 3],
+    /// Unit axis of the joint in its own frame.
+    pub axis: [f64; 3],
+}
+
+/// Where a key node sits.
+#[derive(Clone, Debug, PartialEq)]
+pub struct KeyNodeSite {
+    /// One of [`KEY_NODE_NAMES`].
+    pub name: &'static str,
+    /// Body that carries it.
+    pub body: String,
+    /// Position in the body's frame, metres.
+    pub offset: [f64; 3],
+}
+
+/// A link as a sphere, for the collision loss of the EMP.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LinkSphere {
+    /// Name, unique in the robot.
+    pub name: String,
+    /// Body that carries it.
+    pub body: String,
+    /// Centre in the body's frame, metres.
+    pub center: [f64; 3],
+    /// Radius, metres.
+    pub radius: f64,
+}
+
+/// A foot: the spheres it touches the floor with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Foot {
+    /// Body that carries it; its z axis is the sole's normal.
+    pub body: String,
+    /// Radius of the spheres, metres.
+    pub radius: f64,
+    /// Centres in the body's frame, metres.
+    pub centers: Vec<[f64; 3]>,
+    /// Names of the spheres' geoms in the model, in the order of `centers`.
+    pub geoms: Vec<String>,
+}
+
+impl Foot {
+    fn new(config: &FootConfig) -> Self {
+        Self {
+            body: config.body.clone(),
+            radius: config.radius,
+            centers: config.centers.clone(),
+            geoms: (0..config.centers.len())
+                .map(|i| model::foot_geom(&config.body, i))
+                .collect(),
+        }
+    }
+
+    /// Centre of the sole in the body's frame: the mean of the spheres' lowest points.
+    pub fn sole_center(&self) -> [f64; 3] {
+        let mean = self
+            .centers
+            .iter()
+            .map(|center| Vector3::from(*center))
+            .sum::<Vector3<f64>>()
+            / self.centers.len() as f64;
+        (mean - Vector3::z() * self.radius).into()
+    }
+}
+
+/// A robot, loaded and checked. Immutable; share it in an [`Arc`](std::sync::Arc).
+#[derive(Debug)]
+pub struct Robot {
+    config_file: PathBuf,
+    model_file: PathBuf,
+    config: Config,
+    goal_joints: Vec<Joint>,
+    leg_joints: Vec<Joint>,
+    goal_tree: Vec<GoalNode>,
+    key_nodes: Vec<KeyNodeSite>,
+    link_spheres: Vec<LinkSphere>,
+    link_pairs: Vec<[usize; 2]>,
+    feet: [Foot; 2],
+    base_body: String,
+    standing_height: f64,
+    kinematics: Kinematics,
+    model: MjModel,
+}
+
+impl Robot {
+    /// Loads the robot whose `robot.toml` is in the folder `dir`, and the MJCF model that it names.
+    ///
+    /// # Errors
+    /// If a file is missing or malformed, or if the two disagree; see [`RobotError`].
+    pub fn load(dir: &Path) -> Result<Self, RobotError> {
+        let config_file = dir.join(CONFIG_FILE);
+        let config = Config::load(&config_file)?;
+        let model_file = dir.join(&config.model);
+        let files = Files {
+            config: &config_file,
+            model: &model_file,
+        };
+        let model = model::compile(&files, &config, Shapes::Physical)?;
+        let loader = Loader {
+            files,
+            config: &config,
+            model: &model,
+        };
+
+        let base = loader.base()?;
+        let (goal_joints, leg_joints, columns) = loader.joints(base)?;
+        let feet = [
+            Foot::new(&config.contacts.left_foot),
+            Foot::new(&config.contacts.right_foot),
+        ];
+        let attached = loader.attached(base, goal_joints.len(), &columns, &feet)?;
+        loader.check_masses()?;
+        loader.check_imu()?;
+        let dof = goal_joints.len() + leg_joints.len();
+        let kinematics = Kinematics::new(&model, base, &columns, dof, goal_joints.len(), &attached);
+        let goal_tree = goal_tree::build(&model, base, &columns, goal_joints.len());
+        let standing_height = standing_height(&model, &goal_joints, &leg_joints, &feet);
+
+        let robot = Self {
+            goal_tree,
+            key_nodes: key_nodes(&config),
+            link_spheres: link_spheres(&config),
+            link_pairs: link_pairs(&config),
+            feet,
+            base_body: body_name(&model, base),
+            standing_height,
+            kinematics,
+            goal_joints,
+            leg_joints,
+            model,
+            config_file,
+            model_file,
+            config,
+        };
+        robot.check_default_pose()?;
+        Ok(robot)
+    }
+
+    /// Name of the robot, as requests and checkpoints give it.
+    pub fn name(&self) -> &str {
+        &self.config.name
+    }
+
+    /// The joints that retargeting and the EMP move, in goal order.
+    pub fn goal_joints(&self) -> &[Joint] {
+        &self.goal_joints
+    }
+
+    /// The joints that the standing policy moves, in leg order.
+    pub fn leg_joints(&self) -> &[Joint] {
+        &self.leg_joints
+    }
+
+    /// Goal joints, then leg joints: the order of every joint vector, and of the model's actuators.
+    pub fn joints(&self) -> impl Iterator<Item = &Joint> {
+        self.goal_joints.iter().chain(&self.leg_joints)
+    }
+
+    /// The goal joints as a graph, in goal order.
+    pub fn goal_tree(&self) -> &[GoalNode] {
+        &self.goal_tree
+    }
+
+    /// How often joint targets change, Hz.
+    pub fn control_rate_hz(&self) -> f64 {
+        self.config.control.rate_hz
+    }
+
+    /// Timestep of the physics, seconds.
+    pub fn timestep(&self) -> f64 {
+        self.config.control.timestep
+    }
+
+    /// Physics steps in one control period.
+    pub fn substeps(&self) -> usize {
+        (1.0 / (self.control_rate_hz() * self.timestep())).round() as usize
+    }
+
+    /// Radians of leg target, away from the default pose, for one unit of a policy's action.
+    pub fn action_scale(&self) -> f64 {
+        self.config.control.action_scale
+    }
+
+    /// The key nodes, in the order of [`KEY_NODE_NAMES`].
+    pub fn key_nodes(&self) -> &[KeyNodeSite] {
+        &self.key_nodes
+    }
+
+    /// The links as spheres.
+    pub fn link_spheres(&self) -> &[LinkSphere] {
+        &self.link_spheres
+    }
+
+    /// Pairs of indices into [`link_spheres`](Self::link_spheres) that may touch.
+    pub fn link_pairs(&self) -> &[[usize; 2]] {
+        &self.link_pairs
+    }
+
+    /// Pairs of geoms of the model that may touch: the robot's self-collisions.
+    pub fn contact_pairs(&self) -> &[[String; 2]] {
+        &self.config.contacts.pairs
+    }
+
+    /// The feet, left and right.
+    pub fn feet(&self) -> &[Foot; 2] {
+        &self.feet
+    }
+
+    /// Name of the floating base's body, the pelvis.
+    pub fn base_body(&self) -> &str {
+        &self.base_body
+    }
+
+    /// Name of the inertial measurement unit's site in the model.
+    pub fn imu_site(&self) -> &str {
+        &self.config.imu_site
+    }
+
+    /// Height of the base above the floor when the robot stands in its default pose, metres.
+    pub fn standing_height(&self) -> f64 {
+        self.standing_height
+    }
+
+    /// Mass of the whole robot, kg.
+    pub fn mass(&self) -> f64 {
+        self.model.totalmass()
+    }
+
+    /// Forward kinematics.
+    pub fn kinematics(&self) -> &Kinematics {
+        &self.kinematics
+    }
+
+    /// A copy of the compiled model: locked joints removed, a position actuator for each joint (named like it, in the
+    /// order of [`joints`](Self::joints)), contacts as [`feet`](Self::feet) and
+    /// [`contact_pairs`](Self::contact_pairs) say, a floor, and no visual shapes.
+    pub fn model(&self) -> MjModel {
+        self.model.clone()
+    }
+
+    /// As [`model`](Self::model), with the visual shapes: for pictures. Reads the MJCF and its meshes again.
+    ///
+    /// # Errors
+    /// If the files have gone or changed into something that MuJoCo refuses.
+    pub fn visual_model(&self) -> Result<MjModel, RobotError> {
+        let files = Files {
+            config: &self.config_file,
+            model: &self.model_file,
+        };
+        model::compile(&files, &self.config, Shapes::All)
+    }
+
+    /// Refuses a default pose in which links that may touch do so.
+    fn check_default_pose(&self) -> Result<(), RobotError> {
+        let q: Vec<f64> = self.joints().map(|joint| joint.default).collect();
+        let mut out = vec![0.0; self.kinematics.output_width()];
+        self.kinematics.forward(&q, &mut out);
+        let links = &out[self.kinematics.layout().link_centers.clone()];
+        for (i, &[first, second]) in self.link_pairs.iter().enumerate() {
+            let center = |link: usize| Vector3::from_column_slice(&links[3 * link..3 * link + 3]);
+            let distance = (center(first) - center(second)).norm();
+            let touching = self.link_spheres[first].radius + self.link_spheres[second].radius;
+            if distance <= touching {
+                return Err(RobotError::value(
+                    &self.config_file,
+                    format!("links.pairs[{i}]"),
+                    format!("spheres more than {touching} m apart in the default pose"),
+                    format!("{distance:.4} m between {:?}", self.config.links.pairs[i]),
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The robot folders in `dir` (`robots/` of the project): those that hold a `robot.toml`, sorted by name.
+///
+/// # Errors
+/// If the folder cannot be read.
+pub fn robot_folders(dir: &Path) -> Result<Vec<PathBuf>, RobotError> {
+    let read = |source| RobotError::Read {
+        file: dir.to_path_buf(),
+        source,
+    };
+    let mut folders = Vec::new();
+    for entry in std::fs::read_dir(dir).map_err(read)? {
+        let path = entry.map_err(read)?.path();
+        if path.join(CONFIG_FILE).is_file() {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    Ok(folders)
+}
+
+fn key_nodes(config: &Config) -> Vec<KeyNodeSite> {
+    let site = |(name, (body, offset)): (&'static str, (&str, [f64; 3]))| KeyNodeSite {
+        name,
+        body: body.to_owned(),
+        offset,
+    };
+    KEY_NODE_NAMES
+        .into_iter()
+        .zip(config.key_nodes.points())
+        .map(site)
+        .collect()
+}
+
+fn link_spheres(config: &Config) -> Vec<LinkSphere> {
+    let sphere = |sphere: &SphereConfig| LinkSphere {
+        name: sphere.name.clone(),
+        body: sphere.body.clone(),
+        center: sphere.center,
+        radius: sphere.radius,
+    };
+    config.links.spheres.iter().map(sphere).collect()
+}
+
+/// The pairs by index; their names are known to exist.
+fn link_pairs(config: &Config) -> Vec<[usize; 2]> {
+    let spheres = &config.links.spheres;
+    let index = |name: &String| spheres.iter().position(|sphere| sphere.name == *name);
+    config
+        .links
+        .pairs
+        .iter()
+        .filter_map(|[first, second]| Some([index(first)?, index(second)?]))
+        .collect()
+}
+
+/// Height of the base at which the lowest foot sphere touches the floor in the default pose, base upright.
+fn standing_height(model: &MjModel, goal: &[Joint], leg: &[Joint], feet: &[Foot; 2]) -> f64 {
+    let mut data = model.make_data();
+    let qpos = data.qpos_mut();
+    qpos.fill(0.0);
+    qpos[3] = 1.0;
+    for joint in goal.iter().chain(leg) {
+        qpos[joint.qpos_address] = joint.default;
+    }
+    data.kinematics();
+    let bottoms = feet
+        .iter()
+        .flat_map(|foot| foot.geoms.iter().map(|name| (name, foot.radius)));
+    bottoms
+        .filter_map(|(name, radius)| {
+            Some((model.name_to_id(MjtObjBase::mjOBJ_GEOM, name)?, radius))
+        })
+        .map(|(geom, radius)| radius - data.geom_xpos()[geom][2])
+        .fold(f64::NEG_INFINITY, f64::max)
+}
+
+fn body_name(model: &MjModel, body: usize) -> String {
+    model
+        .id_to_name(MjtObjBase::mjOBJ_BODY, body)
+        .unwrap_or_default()
+        .to_owned()
+}
+
+/// Checks the configuration against the compiled model.
+struct Loader<'a> {
+    files: Files<'a>,
+    config: &'a Config,
+    model: &'a MjModel,
+}
+
+impl Loader<'_> {
+    fn error(
+        &self,
+        key: impl Into<String>,
+        expected: impl Into<String>,
+        found: impl Into<String>,
+    ) -> RobotError {
+        RobotError::value(self.files.config, key, expected, found)
+    }
+
+    fn body(&self, key: String, name: &str) -> Result<usize, RobotError> {
+        let missing = || {
+            let expected = format!("a body of {}", self.files.model.display());
+            self.error(key, expected, format!("{name:?}"))
+        };
+        self.model
+            .name_to_id(MjtObjBase::mjOBJ_BODY, name)
+            .ok_or_else(missing)
+    }
+
+    /// The body that floats: the only one with a free joint, standing directly in the world.
+    fn base(&self) -> Result<usize, RobotError> {
+        let free: Vec<usize> = (0..self.model.jnt_type().len())
+            .filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_FREE)
+            .collect();
+        // MuJoCo allows free joints in top-level bodies only; `qpos` starts with the base's.
+        match free[..] {
+            [0] => Ok(self.model.jnt_bodyid()[0] as usize),
+            _ => Err(self.error(
+                "model",
+                "a model with one free joint, that of the base, before all others",
+                format!("{} free joints", free.len()),
+            )),
+        }
+    }
+
+    /// Goal joints, leg joints, and the column in a joint vector of each joint id.
+    fn joints(&self, base: usize) -> Result<(Vec<Joint>, Vec<Joint>, Vec<usize>), RobotError> {
+        let joints = self.model.jnt_type().len();
+        let mut columns = vec![usize::MAX; joints];
+        let mut all = Vec::new();
+        for (column, (key, config)) in self.config.joints.keyed().enumerate() {
+            let (id, joint) = self.joint(&key, config, base)?;
+            columns[id] = column;
+            all.push(joint);
+        }
+        for (id, column) in columns.iter().enumerate().skip(1) {
+            if *column == usize::MAX {
+                let name = self
+                    .model
+                    .id_to_name(MjtObjBase::mjOBJ_JOINT, id)
+                    .unwrap_or("a joint without a name");
+                let expected =
+                    "every joint of the model in joints.goal, joints.leg or joints.locked";
+                return Err(self.error("joints", expected, format!("{name:?} in none of them")));
+            }
+        }
+        let leg = all.split_off(self.config.joints.goal.len());
+        Ok((all, leg, columns))
+    }
+
+    fn joint(
+        &self,
+        key: &str,
+        config: &JointConfig,
+        base: usize,
+    ) -> Result<(usize, Joint), RobotError> {
+        let model = self.model;
+        let name_key = format!("{key}.name");
+        let expect = |expected: &str, found: String| self.error(&name_key, expected, found);
+        let id = model
+            .name_to_id(MjtObjBase::mjOBJ_JOINT, &config.name)
+            .ok_or_else(|| expect("a joint of the model", format!("{:?}", config.name)))?;
+        if model.jnt_type()[id] != MjtJoint::mjJNT_HINGE {
+            return Err(expect(
+                "a hinge",
+                format!("{:?} of another type", config.name),
+            ));
+        }
+        if model.body_rootid()[model.jnt_bodyid()[id] as usize] as usize != base {
+            return Err(expect(
+                "a joint below the base",
+                format!("{:?} elsewhere", config.name),
+            ));
+        }
+        let qpos_address = model.jnt_qposadr()[id] as usize;
+        if model.qpos0()[qpos_address] != 0.0 {
+            let found = format!("ref {} of {:?}", model.qpos0()[qpos_address], config.name);
+            return Err(expect("a joint with reference angle 0", found));
+        }
+        let range = model.jnt_range()[id];
+        let limited = model.jnt_limited()[id] && range.iter().all(|limit| limit.is_finite());
+        if !limited || range[0] >= range[1] {
+            let found = if limited {
+                format!("{range:?} of {:?}", config.name)
+            } else {
+                "none".to_owned()
+            };
+            return Err(expect(
+                "a joint with a range from its lower to its upper limit",
+                found,
+            ));
+        }
+        if !(range[0]..=range[1]).contains(&config.default) {
+            let expected = format!("an angle within the joint's range {range:?}");
+            return Err(self.error(
+                format!("{key}.default"),
+                expected,
+                config.default.to_string(),
+            ));
+        }
+        Ok((
+            id,
+            Joint {
+                name: config.name.clone(),
+                range,
+                kp: config.kp,
+                kd: config.kd,
+                torque_limit: config.torque_limit,
+                velocity_limit: config.velocity_limit,
+                armature: config.armature,
+                damping: config.damping,
+                default: config.default,
+                qpos_address,
+                dof_address: model.jnt_dofadr()[id] as usize,
+            },
+        ))
+    }
+
+    /// What is attached to bodies: key nodes, wrist frames, link spheres, soles.
+    fn attached(
+        &self,
+        base: usize,
+        goal_joints: usize,
+        columns: &[usize],
+        feet: &[Foot; 2],
+    ) -> Result<Attached, RobotError> {
+        let mut key_nodes = Vec::new();
+        for (name, (body, offset)) in KEY_NODE_NAMES
+            .into_iter()
+            .zip(self.config.key_nodes.points())
+        {
+            let key = format!("key_nodes.{name}.body");
+            let id = self.robot_body(key.clone(), body, base)?;
+            let is_goal = |joint: usize| columns[joint] < goal_joints;
+            if !self.carriers(id, base).all(is_goal) {
+                return Err(self.error(key, "a body that no leg joint moves", format!("{body:?}")));
+            }
+            key_nodes.push((id, Vector3::from(offset)));
+        }
+        if key_nodes[0].0 != base {
+            let expected = format!("the base, {:?}", body_name(self.model, base));
+            return Err(self.error(
+                "key_nodes.waist.body",
+                expected,
+                format!("{:?}", self.config.key_nodes.waist.body),
+            ));
+        }
+        let [left, right] = self.config.key_nodes.wrists().map(wrist_axes);
+        let [left_body, right_body] = [key_nodes[KEY_NODES - 2].0, key_nodes[KEY_NODES - 1].0];
+        Ok(Attached {
+            key_nodes,
+            links: self.links(base)?,
+            wrists: [(left_body, left), (right_body, right)],
+            soles: [
+                self.sole("contacts.left_foot", &feet[0], base)?,
+                self.sole("contacts.right_foot", &feet[1], base)?,
+            ],
+        })
+    }
+
+    fn links(&self, base: usize) -> Result<Vec<(usize, Vector3<f64>)>, RobotError> {
+        let spheres = self.config.links.spheres.iter().enumerate();
+        spheres
+            .map(|(i, sphere)| {
+                let body =
+                    self.robot_body(format!("links.spheres[{i}].body"), &sphere.body, base)?;
+                Ok((body, Vector3::from(sphere.center)))
+            })
+            .collect()
+    }
+
+    fn sole(
+        &self,
+        key: &str,
+        foot: &Foot,
+        base: usize,
+    ) -> Result<(usize, Vector3<f64>), RobotError> {
+        let body = self.robot_body(format!("{key}.body"), &foot.body, base)?;
+        Ok((body, Vector3::from(foot.sole_center())))
+    }
+
+    /// A body of the robot: the base or one below it.
+    fn robot_body(&self, key: String, name: &str, base: usize) -> Result<usize, RobotError> {
+        let body = self.body(key.clone(), name)?;
+        if self.model.body_rootid()[body] as usize != base {
+            return Err(self.error(key, "a body of the robot", format!("{name:?}")));
+        }
+        Ok(body)
+    }
+
+    /// The joints that carry `body`, the base's excluded.
+    fn carriers(&self, body: usize, base: usize) -> impl Iterator<Item = usize> {
+        let parent = |&body: &usize| Some(self.model.body_parentid()[body] as usize);
+        std::iter::successors(Some(body), parent)
+            .take_while(move |&body| body != base)
+            .flat_map(|body| {
+                let first = self.model.body_jntadr()[body].max(0) as usize;
+                first..first + self.model.body_jntnum()[body] as usize
+            })
+    }
+
+    fn check_masses(&self) -> Result<(), RobotError> {
+        for (body, &mass) in self.model.body_mass().iter().enumerate() {
+            if !(mass.is_finite() && mass >= 0.0) {
+                let found = format!("{mass} of body {:?}", body_name(self.model, body));
+                return Err(self.error("model", "bodies with finite masses", found));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_imu(&self) -> Result<(), RobotError> {
+        let name = &self.config.imu_site;
+        match self.model.name_to_id(MjtObjBase::mjOBJ_SITE, name) {
+            Some(_) => Ok(()),
+            None => {
+                let expected = format!("a site of {}", self.files.model.display());
+                Err(self.error("imu_site", expected, format!("{name:?}")))
+            }
+        }
+    }
+}
+
+/// The wrist convention in the wrist body's frame: x to the fingers, z to the thumb, y = z × x, as columns.
+///
+/// The configuration's vectors are unit and at right angles to within rounding; the result is an exact rotation.
+fn wrist_axes(wrist: &WristConfig) -> Matrix3<f64> {
+    let x = Vector3::from(wrist.fingers).normalize();
+    let y = Vector3::from(wrist.thumb).cross(&x).normalize();
+    Matrix3::from_columns(&[x, y, x.cross(&y)])
+}

@@ -1,0 +1,147 @@
+//! Contacts of a robot with itself.
+
+use std::collections::HashSet;
+
+use emp_robot::Robot;
+use mujoco_rs::prelude::*;
+use mujoco_rs::wrappers::mj_auxiliary::MjContact;
+
+use crate::SimError;
+use crate::replay::{check_angles, set_pose};
+
+/// The pairs of geoms whose contact is a self-collision, by their numbers in a model.
+pub(crate) struct ContactPairs(HashSet<[i32; 2]>);
+
+impl ContactPairs {
+    pub(crate) fn new(robot: &Robot, model: &MjModel) -> Result<Self, SimError> {
+        let id = |geom: &String| {
+            let id = model.name_to_id(MjtObjBase::mjOBJ_GEOM, geom);
+            id.map(|id| id as i32)
+                .ok_or_else(|| SimError::MissingGeom { geom: geom.clone() })
+        };
+        let pairs = robot
+            .contact_pairs()
+            .iter()
+            .map(|[first, second]| Ok(ordered([id(first)?, id(second)?])));
+        Ok(Self(pairs.collect::<Result<_, SimError>>()?))
+    }
+
+    /// Whether one of the pairs touches, by the contacts that MuJoCo found last.
+    pub(crate) fn touch(&self, contacts: &[MjContact]) -> bool {
+        contacts
+            .iter()
+            .any(|contact| contact.dist <= 0.0 && self.0.contains(&ordered(contact.geom)))
+    }
+}
+
+fn ordered([first, second]: [i32; 2]) -> [i32; 2] {
+    [first.min(second), first.max(second)]
+}
+
+/// Tells whether poses of the goal joints touch themselves: geometry alone, legs in their default pose.
+pub struct SelfCollision<'a> {
+    robot: &'a Robot,
+    data: MjData<Box<MjModel>>,
+    pairs: ContactPairs,
+}
+
+impl<'a> SelfCollision<'a> {
+    /// For the robot's collision pairs.
+    ///
+    /// # Errors
+    /// If MuJoCo has no memory for it.
+    pub fn new(robot: &'a Robot) -> Result<Self, SimError> {
+        let model = Box::new(robot.model());
+        let pairs = ContactPairs::new(robot, &model)?;
+        Ok(Self {
+            robot,
+            data: MjData::try_new(model)?,
+            pairs,
+        })
+    }
+
+    /// Whether the pose `angles` (goal order, radians) touches itself.
+    ///
+    /// # Errors
+    /// If it is not one finite angle for each goal joint; the error calls the pose frame 0.
+    pub fn touches(&mut self, angles: &[f32]) -> Result<bool, SimError> {
+        check_angles(self.robot, 0, angles)?;
+        set_pose(self.robot, &mut self.data, angles);
+        self.data.kinematics();
+        self.data.collision();
+        Ok(self.pairs.touch(self.data.contact()))
+    }
+
+    /// Share of the frames (rows of goal-joint angles, radians) that touch themselves; 0 of no frames.
+    ///
+    /// # Errors
+    /// If a frame is not one finite angle for each goal joint.
+    pub fn share(&mut self, frames: &[impl AsRef<[f32]>]) -> Result<f64, SimError> {
+        let mut touching = 0_usize;
+        for (frame, angles) in frames.iter().enumerate() {
+            check_angles(self.robot, frame, angles.as_ref())?;
+            touching += usize::from(self.touches(angles.as_ref())?);
+        }
+        Ok(touching as f64 / frames.len().max(1) as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::replay;
+    use crate::testing::{for_each_robot, pose};
+
+    /// Both arms hang straight down and are pressed against the thighs or each other.
+    fn pressed(robot: &Robot) -> Vec<f32> {
+        let arms = [
+            ("left_shoulder_roll", -0.4),
+            ("right_shoulder_roll", 0.4),
+            ("elbow", if robot.name() == "g1" { 1.5 } else { 0.0 }),
+            ("shoulder_pitch", 0.0),
+        ];
+        pose(robot, &arms)
+    }
+
+    #[test]
+    fn hands_on_the_body_touch_and_hanging_arms_do_not() {
+        for_each_robot(|robot| {
+            let mut collision = SelfCollision::new(robot).unwrap();
+            let (free, pressed) = (pose(robot, &[]), pressed(robot));
+            assert!(!collision.touches(&free).unwrap(), "{}", robot.name());
+            assert!(collision.touches(&pressed).unwrap(), "{}", robot.name());
+            assert_eq!(
+                collision.share(&[&free, &pressed, &free, &free]).unwrap(),
+                0.25,
+                "{}",
+                robot.name()
+            );
+            assert_eq!(collision.share(&[] as &[Vec<f32>]).unwrap(), 0.0);
+        });
+    }
+
+    #[test]
+    fn physics_reports_the_contact_that_geometry_sees() {
+        for_each_robot(|robot| {
+            let replay = replay(robot, &vec![pressed(robot); 10]).unwrap();
+            assert!(replay.frames[0].self_collision, "{}", robot.name());
+            // The contact pushes the hands off, the servos press them on again.
+            assert!(replay.self_collision_share() >= 0.5, "{}", robot.name());
+        });
+    }
+
+    #[test]
+    fn bad_poses_are_refused() {
+        for_each_robot(|robot| {
+            let mut collision = SelfCollision::new(robot).unwrap();
+            assert!(collision.touches(&[0.0; 2]).is_err());
+            let mut nan = pose(robot, &[]);
+            nan[0] = f32::NAN;
+            let error = collision
+                .share(&[pose(robot, &[]), nan])
+                .unwrap_err()
+                .to_string();
+            assert!(error.contains("frame 1"), "{error}");
+        });
+    }
+}

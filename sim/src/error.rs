@@ -1,0 +1,45 @@
+//! What can go wrong in a simulation.
+
+use mujoco_rs::prelude::MjDataError;
+
+/// Why a simulation could not be run to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum SimError {
+    /// A frame has the wrong number of joint angles.
+    #[error("frame {frame}: expected {expected} joint angles, found {found}")]
+    Width {
+        /// Index of the frame.
+        frame: usize,
+        /// Goal joints of the robot.
+        expected: usize,
+        /// Angles in the frame.
+        found: usize,
+    },
+    /// A joint angle is NaN or infinite.
+    #[error("frame {frame}: the angle of {joint} is {value}")]
+    NotFinite {
+        /// Index of the frame.
+        frame: usize,
+        /// Name of the joint.
+        joint: String,
+        /// The angle.
+        value: f32,
+    },
+    /// The physics left what it can compute: its state is not to be trusted from this frame on.
+    #[error("frame {frame}: the simulation diverged: {reason}")]
+    Diverged {
+        /// Index of the frame.
+        frame: usize,
+        /// MuJoCo's warning.
+        reason: &'static str,
+    },
+    /// A collision pair names a geom that the compiled model lacks.
+    #[error("the model has no geom {geom:?}, which a collision pair names")]
+    MissingGeom {
+        /// Name of the geom.
+        geom: String,
+    },
+    /// MuJoCo had no memory for the simulation.
+    #[error("cannot make a simulation: {0}")]
+    Data(#[from] MjDataError),
+}

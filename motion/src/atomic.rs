@@ -1,0 +1,23 @@
+//! Files that appear whole or not at all.
+
+use std::path::Path;
+
+use tempfile::NamedTempFile;
+
+use crate::MotionError;
+
+/// A temporary file in the folder of `path`, gone when dropped.
+pub(crate) fn temporary(path: &Path) -> Result<NamedTempFile, MotionError> {
+    let folder = path
+        .parent()
+        .filter(|p| !p.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
+    NamedTempFile::new_in(folder).map_err(|e| MotionError::io(path, e))
+}
+
+/// Gives a complete temporary file its name.
+pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<(), MotionError> {
+    file.persist(path)
+        .map(drop)
+        .map_err(|e| MotionError::io(path, e.error))
+}

@@ -1,0 +1,241 @@
+//! Procedural skills: the default motions where no recordings are at hand.
+//!
+//! Everything follows from the seed: body size and proportions, tempo, arms, places and rhythm. Clips are 50 frames a
+//! second, begin and end with hanging arms, and keep elbows and wrists out of the person's own trunk.
+
+mod body;
+mod scripts;
+mod timeline;
+
+use std::f64::consts::TAU;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{Clip, KeyNodeFrame, Side};
+use body::{Body, Pose};
+use scripts::Performance;
+use timeline::{FPS, Timeline};
+
+/// Share of clips without wrist orientations, as in many recordings.
+const SHARE_WITHOUT_WRISTS: f64 = 0.2;
+/// Tries at a performance that keeps clear of the body; the last is kept as it is.
+const TRIES: usize = 40;
+/// Peak hand speed of the way back to rest, m/s.
+const RETURN_SPEED: f64 = 1.2;
+
+/// Something a person does with the upper body.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Skill {
+    /// Blows with a hammer at waist height.
+    Hammer,
+    /// Screwing in a light bulb overhead.
+    ScrewLightBulb,
+    /// Waving with a raised hand or both.
+    Wave,
+    /// Drinking from a cup that stands on a table.
+    Drink,
+    /// Wiping a window with a flat hand or both.
+    WipeWindow,
+    /// Punching with both fists in turn.
+    Punch,
+    /// Clapping in front of the chest.
+    Clap,
+    /// Reaching forward.
+    ReachFront,
+    /// Reaching sideways.
+    ReachSide,
+    /// Reaching up.
+    ReachOverhead,
+    /// Reaching down in front of the legs.
+    ReachLow,
+    /// Lifting a box with both hands.
+    LiftBox,
+    /// Directing traffic: stop, point, beckon.
+    DirectTraffic,
+    /// Combing the hair.
+    CombHair,
+    /// Circling with stretched arms.
+    ArmCircles,
+    /// Standing at ease.
+    Idle,
+    /// Reaching to random places all over the reachable space.
+    RandomReaches,
+}
+
+impl Skill {
+    /// All skills, in the order of a medley.
+    pub const ALL: [Self; 17] = [
+        Self::Idle,
+        Self::Wave,
+        Self::ReachFront,
+        Self::Hammer,
+        Self::Drink,
+        Self::ReachOverhead,
+        Self::ScrewLightBulb,
+        Self::Clap,
+        Self::Punch,
+        Self::ReachSide,
+        Self::WipeWindow,
+        Self::LiftBox,
+        Self::CombHair,
+        Self::DirectTraffic,
+        Self::ReachLow,
+        Self::ArmCircles,
+        Self::RandomReaches,
+    ];
+
+    /// The skill's name in clips and on the command line.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hammer => "hammer",
+            Self::ScrewLightBulb => "screw-light-bulb",
+            Self::Wave => "wave",
+            Self::Drink => "drink",
+            Self::WipeWindow => "wipe-window",
+            Self::Punch => "punch",
+            Self::Clap => "clap",
+            Self::ReachFront => "reach-front",
+            Self::ReachSide => "reach-side",
+            Self::ReachOverhead => "reach-overhead",
+            Self::ReachLow => "reach-low",
+            Self::LiftBox => "lift-box",
+            Self::DirectTraffic => "direct-traffic",
+            Self::CombHair => "comb-hair",
+            Self::ArmCircles => "arm-circles",
+            Self::Idle => "idle",
+            Self::RandomReaches => "random-reaches",
+        }
+    }
+
+    /// The skills that both arms may do at once in the same way.
+    fn allows_both_arms(self) -> bool {
+        matches!(
+            self,
+            Self::Wave
+                | Self::WipeWindow
+                | Self::ReachFront
+                | Self::ReachSide
+                | Self::ReachOverhead
+                | Self::ReachLow
+                | Self::ArmCircles
+                | Self::RandomReaches
+        )
+    }
+}
+
+/// One performance of a skill, 3 to 20 s.
+#[must_use]
+pub fn generate(skill: Skill, seed: u64) -> Clip {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let body = Body::random(&mut rng);
+    let with_wrists = !rng.random_bool(SHARE_WITHOUT_WRISTS);
+    let mut time = Timeline::new(&body);
+    time.hold(rng.random_range(0.1..0.5));
+    append(&mut time, &body, skill, false, &mut rng);
+    time.move_to(Pose::rest(), RETURN_SPEED);
+    let mut clip = finish(format!("{}-{seed}", skill.name()), &body, &time, &mut rng);
+    if !with_wrists {
+        clip.frames
+            .iter_mut()
+            .for_each(|frame| frame.wrist_rotations = [None; 2]);
+    }
+    clip
+}
+
+/// Every skill once, briefly, by one person, 30 to 45 s.
+#[must_use]
+pub fn medley(seed: u64) -> Clip {
+    medley_with_starts(seed).0
+}
+
+/// The medley, and the frame at which each skill of [`Skill::ALL`] begins.
+fn medley_with_starts(seed: u64) -> (Clip, Vec<usize>) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let body = Body::random(&mut rng);
+    let mut time = Timeline::new(&body);
+    let starts = Skill::ALL
+        .into_iter()
+        .map(|skill| {
+            let start = time.poses.len();
+            append(&mut time, &body, skill, true, &mut rng);
+            start
+        })
+        .collect();
+    time.move_to(Pose::rest(), RETURN_SPEED);
+    (
+        finish(format!("medley-{seed}"), &body, &time, &mut rng),
+        starts,
+    )
+}
+
+/// A varied set of clips: two thirds go through the skills in turn, one third are random reaches.
+#[must_use]
+pub fn library(seed: u64, clips: usize) -> Vec<Clip> {
+    let mut seeds = ChaCha8Rng::seed_from_u64(seed);
+    let mut skills = Skill::ALL.into_iter().cycle();
+    (0..clips)
+        .map(|index| {
+            let skill = if index % 3 == 2 {
+                Some(Skill::RandomReaches)
+            } else {
+                skills.next()
+            };
+            generate(skill.unwrap_or(Skill::RandomReaches), seeds.random())
+        })
+        .collect()
+}
+
+/// Performs a skill from the timeline's current pose, drawing again until arms and trunk keep clear of each other.
+fn append(time: &mut Timeline, body: &Body, skill: Skill, brief: bool, rng: &mut ChaCha8Rng) {
+    let start = time.poses.len();
+    for _ in 0..TRIES {
+        time.poses.truncate(start);
+        let how = Performance {
+            body,
+            sides: sides(skill, rng),
+            tempo: rng.random_range(0.75..1.3),
+            brief,
+        };
+        scripts::perform(skill, time, &how, rng);
+        let clear = |pose: &Pose| body.is_clear(&body.frame(pose));
+        if time.poses[start..].iter().all(clear) {
+            return;
+        }
+    }
+}
+
+fn sides(skill: Skill, rng: &mut ChaCha8Rng) -> Vec<Side> {
+    if skill.allows_both_arms() && rng.random_bool(0.4) {
+        return Side::BOTH.to_vec();
+    }
+    vec![if rng.random_bool(0.5) {
+        Side::Left
+    } else {
+        Side::Right
+    }]
+}
+
+/// Adds the sway of a living body and turns poses into frames.
+fn finish(name: String, body: &Body, time: &Timeline, rng: &mut ChaCha8Rng) -> Clip {
+    let mut sway = |amplitude: f64| {
+        let (rate, phase) = (rng.random_range(0.1..0.35), rng.random_range(0.0..TAU));
+        move |t: f64| amplitude * (TAU * rate * t + phase).sin()
+    };
+    let (yaw, lean, left, right) = (sway(0.02), sway(0.008), sway(0.006), sway(0.006));
+    let frame = |(index, pose): (usize, &Pose)| -> KeyNodeFrame {
+        let t = index as f64 / FPS;
+        let mut pose = *pose;
+        pose.yaw += yaw(t);
+        pose.lean += lean(t);
+        pose.arms[0].hand.x += left(t);
+        pose.arms[1].hand.x += right(t);
+        body.frame(&pose)
+    };
+    Clip {
+        name,
+        fps: FPS,
+        frames: time.poses.iter().enumerate().map(frame).collect(),
+    }
+}

@@ -110,7 +110,7 @@ pub(crate) fn from_npz(path: &Path, npz: &mut Npz) -> Result<Clip, MotionError> 
     let fps = npz.scalar(rate)?;
     let poses = body_poses(npz)?;
     source::check_size(path, fps, poses.len())?;
-    let frames: Vec<WorldFrame> = poses.iter().map(|pose| posed(pose)).collect();
+    let frames: Vec<WorldFrame> = poses.iter().map(posed).collect();
     source::into_clip(path, fps, &frames, Heading::Steady)
 }
 

@@ -246,7 +246,7 @@ fn as_written(
         let waist = nodes.node(index, KeyNode::Waist);
         KeyNodeFrame {
             positions: KeyNode::ALL.map(|node| (nodes.node(index, node) - waist).cast::<f32>()),
-            wrist_rotations: wrists.map(|r| r.map(|r| r.cast::<f32>())),
+            wrist_rotations: wrists.map(|r| r.map(Rotation3::cast::<f32>)),
         }
     };
     let frames = wrists.iter().enumerate().map(frame).collect();

@@ -167,7 +167,7 @@ fn forward(joints: &[Joint], values: &[f64]) -> (Vec<Vector3<f64>>, Vec<Rotation
             match channel {
                 Channel::Position(axis) => offset[*axis] = *value,
                 Channel::Rotation(axis) => {
-                    turn *= Rotation3::from_axis_angle(&axes[*axis], value.to_radians())
+                    turn *= Rotation3::from_axis_angle(&axes[*axis], value.to_radians());
                 }
             }
         }

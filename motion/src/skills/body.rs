@@ -1,6 +1,6 @@
 //! A person's proportions, and the posing of trunk and arms: two-bone inverse kinematics per arm.
 
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Matrix, Matrix3, Rotation3, Vector3};
 use rand::{Rng, RngExt};
 
 use crate::{KEY_NODES, KeyNode, KeyNodeFrame, Side};
@@ -168,7 +168,7 @@ impl Body {
                 Some((trunk * Rotation3::from_matrix_unchecked(hand)).cast::<f32>());
         }
         KeyNodeFrame {
-            positions: positions.map(|p| p.cast::<f32>()),
+            positions: positions.map(Matrix::cast::<f32>),
             wrist_rotations: wrists,
         }
     }

@@ -8,6 +8,7 @@ mod scripts;
 mod timeline;
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -21,6 +22,9 @@ use timeline::{FPS, Timeline};
 const SHARE_WITHOUT_WRISTS: f64 = 0.2;
 /// Tries at a performance that keeps clear of the body; the last is kept as it is.
 const TRIES: usize = 40;
+/// Tempos of skills shown at leisure, and of those in a medley.
+const USUAL_PACE: Range<f64> = 0.75..1.3;
+const BRIEF_PACE: Range<f64> = 1.15..1.45;
 /// Peak hand speed of the way back to rest, m/s.
 const RETURN_SPEED: f64 = 1.2;
 
@@ -129,6 +133,8 @@ impl Skill {
 #[must_use]
 pub fn generate(skill: Skill, seed: u64) -> Clip {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    // One seed gives every skill its own person.
+    rng.set_stream(skill as u64);
     let body = Body::random(&mut rng);
     let with_wrists = !rng.random_bool(SHARE_WITHOUT_WRISTS);
     let mut time = Timeline::new(&body);
@@ -144,14 +150,15 @@ pub fn generate(skill: Skill, seed: u64) -> Clip {
     clip
 }
 
-/// Every skill once, briefly, by one person, 30 to 45 s.
+/// Every skill once, briefly, by one person, about 30 to 40 s.
 #[must_use]
 pub fn medley(seed: u64) -> Clip {
     medley_with_starts(seed).0
 }
 
 /// The medley, and the frame at which each skill of [`Skill::ALL`] begins.
-fn medley_with_starts(seed: u64) -> (Clip, Vec<usize>) {
+#[must_use]
+pub fn medley_with_starts(seed: u64) -> (Clip, Vec<usize>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let body = Body::random(&mut rng);
     let mut time = Timeline::new(&body);
@@ -190,12 +197,13 @@ pub fn library(seed: u64, clips: usize) -> Vec<Clip> {
 /// Performs a skill from the timeline's current pose, drawing again until arms and trunk keep clear of each other.
 fn append(time: &mut Timeline, body: &Body, skill: Skill, brief: bool, rng: &mut ChaCha8Rng) {
     let start = time.poses.len();
+    let pace = if brief { BRIEF_PACE } else { USUAL_PACE };
     for _ in 0..TRIES {
         time.poses.truncate(start);
         let how = Performance {
             body,
             sides: sides(skill, rng),
-            tempo: rng.random_range(0.75..1.3),
+            tempo: rng.random_range(pace.clone()),
             brief,
         };
         scripts::perform(skill, time, &how, rng);

@@ -71,10 +71,10 @@ pub(super) fn perform(skill: Skill, time: &mut Timeline, how: &Performance, rng:
         Skill::WipeWindow => wipe_window(time, how, rng),
         Skill::Punch => punch(time, how, rng),
         Skill::Clap => clap(time, how, rng),
-        Skill::ReachFront => reach(time, how, rng, Zone::FRONT),
-        Skill::ReachSide => reach(time, how, rng, Zone::SIDE),
-        Skill::ReachOverhead => reach(time, how, rng, Zone::OVERHEAD),
-        Skill::ReachLow => reach(time, how, rng, Zone::LOW),
+        Skill::ReachFront => reach(time, how, rng, &Zone::FRONT),
+        Skill::ReachSide => reach(time, how, rng, &Zone::SIDE),
+        Skill::ReachOverhead => reach(time, how, rng, &Zone::OVERHEAD),
+        Skill::ReachLow => reach(time, how, rng, &Zone::LOW),
         Skill::LiftBox => lift_box(time, how, rng),
         Skill::DirectTraffic => direct_traffic(time, how, rng),
         Skill::CombHair => comb_hair(time, how, rng),
@@ -328,7 +328,7 @@ impl Zone {
 }
 
 /// Reaches into one zone and back, several times.
-fn reach(time: &mut Timeline, how: &Performance, rng: &mut ChaCha8Rng, zone: Zone) {
+fn reach(time: &mut Timeline, how: &Performance, rng: &mut ChaCha8Rng, zone: &Zone) {
     for _ in 0..how.repeats(rng, 4) {
         let arm = ArmPose {
             hand: zone.sample(rng),

@@ -1,0 +1,21 @@
+//! The AMASS reader answers any archive, and any `poses` array in an archive that is right otherwise.
+#![no_main]
+
+#[path = "../src/archive.rs"]
+mod archive;
+
+use std::path::Path;
+
+use emp_motion::amass;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|data: &[u8]| {
+    check(data);
+    check(&archive::stored(&[("mocap_framerate", &archive::npy("'<f8'", "()", &100_f64.to_le_bytes())), ("poses", data)]));
+});
+
+fn check(archive: &[u8]) {
+    if let Ok(clip) = amass::from_bytes(Path::new("fuzz.npz"), archive) {
+        assert_eq!(clip.validate(), Ok(()));
+    }
+}

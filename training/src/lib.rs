@@ -1,1 +1,8 @@
-//! Placeholder until the crate's first commit.
+//! Training and its reports: losses, trainers, checkpoints of a run, and the `emp-train` command.
+//!
+//! This crate makes the weights that the other crates serve. It never serves, and no other crate depends on it.
+#![forbid(unsafe_code)]
+
+pub mod log;
+pub mod retargeter;
+pub mod run;

@@ -1,0 +1,99 @@
+//! What one human frame asks of a robot, and how the network sees it.
+
+use emp_motion::{KeyNode, KeyNodeFrame, Side};
+use nalgebra::{Matrix3, Vector2, Vector3};
+
+/// The arm bones in the order of [`Target::bones`]: left upper arm, left forearm, right upper arm, right forearm.
+pub const BONES: [(KeyNode, KeyNode); 4] = [
+    (KeyNode::LeftShoulder, KeyNode::LeftElbow),
+    (KeyNode::LeftElbow, KeyNode::LeftWrist),
+    (KeyNode::RightShoulder, KeyNode::RightElbow),
+    (KeyNode::RightElbow, KeyNode::RightWrist),
+];
+
+/// Features of one human node: position (3), first two columns of the wrist's rotation (6), and whether it is known (1).
+pub const NODE_FEATURES: usize = 10;
+
+/// Where the features of a node's wrist rotation begin.
+const ROTATION_FEATURES: usize = 3;
+
+/// The body on which every human frame is redrawn before the network sees it, metres: people of all sizes, and sources
+/// that place the torso node differently, look alike. Only directions matter to the losses.
+mod body {
+    pub(super) const TORSO_HEIGHT: f32 = 0.30;
+    pub(super) const SHOULDER_HEIGHT: f32 = 0.50;
+    pub(super) const HALF_SHOULDER_WIDTH: f32 = 0.20;
+    pub(super) const UPPER_ARM: f32 = 0.28;
+    pub(super) const FOREARM: f32 = 0.25;
+}
+
+/// What one human frame asks of the robot, in the waist's frame (x forward, y left, z up).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Target {
+    /// Unit directions of the arm bones, in the order of [`BONES`].
+    pub bones: [Vector3<f64>; 4],
+    /// Unit direction of the line from the right shoulder to the left, seen from above: the trunk's yaw.
+    pub shoulder_line: Vector2<f64>,
+    /// Rotations of the left and right wrist (x to the fingers, z toward the thumb), where the source has them.
+    pub wrists: [Option<Matrix3<f64>>; 2],
+}
+
+impl Target {
+    /// Reads the target off a validated frame.
+    pub fn new(frame: &KeyNodeFrame) -> Self {
+        let bones = [
+            frame.upper_arm(Side::Left),
+            frame.forearm(Side::Left),
+            frame.upper_arm(Side::Right),
+            frame.forearm(Side::Right),
+        ];
+        let line: Vector2<f64> = frame.shoulder_line().xy().cast();
+        Self {
+            bones: bones.map(|bone| bone.cast()),
+            // A trunk that lies on its side shows no yaw from above.
+            shoulder_line: line.try_normalize(1e-3).unwrap_or_else(Vector2::y),
+            wrists: frame.wrist_rotations.map(|wrist| wrist.map(|wrist| wrist.matrix().cast())),
+        }
+    }
+
+    /// Writes the network's input, [`KeyNode::ALL`] × [`NODE_FEATURES`], row-major.
+    pub fn write_features(&self, out: &mut Vec<f32>) {
+        let positions = self.canonical_positions();
+        for node in KeyNode::ALL {
+            let start = out.len();
+            out.extend(positions[node as usize].iter());
+            out.resize(start + NODE_FEATURES, 0.0);
+            let wrist = match node {
+                KeyNode::LeftWrist => self.wrists[0],
+                KeyNode::RightWrist => self.wrists[1],
+                _ => None,
+            };
+            if let Some(rotation) = wrist {
+                let known = start + ROTATION_FEATURES;
+                for (feature, value) in out[known..].iter_mut().zip(rotation.as_slice()[..6].iter()) {
+                    *feature = *value as f32;
+                }
+                out[start + NODE_FEATURES - 1] = 1.0;
+            }
+        }
+    }
+
+    /// Key-node positions of the canonical body in this pose.
+    fn canonical_positions(&self) -> [Vector3<f32>; emp_motion::KEY_NODES] {
+        let mut positions = [Vector3::zeros(); emp_motion::KEY_NODES];
+        let line = self.shoulder_line.cast::<f32>() * body::HALF_SHOULDER_WIDTH;
+        let shoulder = Vector3::new(line.x, line.y, body::SHOULDER_HEIGHT);
+        positions[KeyNode::Torso as usize] = Vector3::z() * body::TORSO_HEIGHT;
+        positions[KeyNode::LeftShoulder as usize] = shoulder;
+        positions[KeyNode::RightShoulder as usize] = Vector3::new(-line.x, -line.y, shoulder.z);
+        for ((from, to), direction) in BONES.iter().zip(&self.bones) {
+            let length = if matches!(to, KeyNode::LeftElbow | KeyNode::RightElbow) {
+                body::UPPER_ARM
+            } else {
+                body::FOREARM
+            };
+            positions[*to as usize] = positions[*from as usize] + direction.cast::<f32>() * length;
+        }
+        positions
+    }
+}

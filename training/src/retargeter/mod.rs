@@ -1,0 +1,6 @@
+//! Trains the retargeting network (paper, section III) and reports on it.
+
+pub mod data;
+pub mod loss;
+pub mod report;
+pub mod trainer;

@@ -1,0 +1,369 @@
+//! The training loop of the retargeting network: checkpoints, resumption, codebook upkeep.
+
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use candle_core::{DType, Device, Tensor};
+use candle_nn::{VarBuilder, VarMap};
+use emp_models::{
+    CheckpointMetadata,
+    checkpoint::{self, Tensors},
+    optimizer::{Adam, AdamConfig},
+    retarget::{self, NODE_FEATURES, NetworkConfig, RetargetNetwork, Target, network::Decoded},
+};
+use emp_motion::KEY_NODES;
+use emp_robot::Robot;
+use rand::{RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    data::Dataset,
+    loss::{Loss, TargetBatch, Terms},
+};
+use crate::{
+    log::CsvLog,
+    run::{self, Interrupt},
+};
+
+/// Kind of the checkpoints in a run's folder, which hold the optimiser's state too.
+const RUN_KIND: &str = "retargeter-run";
+
+/// Steps between two looks at which codes are in use.
+const CODE_WINDOW: u64 = 100;
+
+/// Settings of a run. Two runs with the same settings, data and binary make the same bits.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Frames a step.
+    pub batch: usize,
+    /// Learning rate at its peak; it falls to a hundredth along a cosine.
+    pub learning_rate: f64,
+    /// Seed of weights and batches.
+    pub seed: u64,
+    /// Procedural clips in the mix.
+    pub procedural_clips: usize,
+}
+
+/// A run: network, optimiser, and how far they are.
+pub struct Trainer {
+    robot: Arc<Robot>,
+    settings: Settings,
+    network: RetargetNetwork,
+    vars: VarMap,
+    adam: Adam,
+    loss: Loss,
+    /// How often each code was chosen since the last look.
+    usage: Vec<f32>,
+}
+
+/// What one step measured.
+struct Step {
+    total: f64,
+    terms: [f64; 7],
+    gradient_norm: f64,
+    perplexity: f64,
+}
+
+impl Trainer {
+    /// Starts with random weights.
+    ///
+    /// # Errors
+    /// When a tensor cannot be made.
+    pub fn new(robot: Arc<Robot>, settings: Settings) -> Result<Self> {
+        let vars = VarMap::new();
+        let config = NetworkConfig::default();
+        let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
+        let network = RetargetNetwork::new(&config, &robot, &builder)?;
+        initialise(&vars, settings.seed)?;
+        let adam = Adam::new(&vars, AdamConfig::default())?;
+        let loss = Loss::new(&robot)?;
+        let usage = vec![0.0; network.codes()];
+        let mut trainer = Self { robot, settings, network, vars, adam, loss, usage };
+        trainer.network.refresh_codebook()?;
+        Ok(trainer)
+    }
+
+    /// Continues from a checkpoint of this run.
+    ///
+    /// # Errors
+    /// When the checkpoint is damaged, or its run had other settings or another robot.
+    pub fn resume(robot: Arc<Robot>, settings: Settings, path: &Path) -> Result<Self> {
+        let (metadata, tensors) = checkpoint::load(path)?;
+        metadata.check(path, RUN_KIND, &robot)?;
+        let saved: Progress = serde_json::from_value(metadata.training)
+            .with_context(|| format!("{}: metadata field training", path.display()))?;
+        ensure!(
+            saved.settings == settings,
+            "{}: the run was started with {:?}, not with {settings:?}",
+            path.display(),
+            saved.settings
+        );
+        let mut trainer = Self::new(robot, settings)?;
+        let tensors = tensors.into_iter().collect();
+        trainer.set_vars(&tensors).with_context(|| format!("{}", path.display()))?;
+        trainer.adam.restore(&tensors, saved.step)?;
+        let Some(usage) = tensors.get("usage") else { bail!("{}: no tensor `usage`", path.display()) };
+        trainer.usage = usage.to_vec1()?;
+        trainer.network.refresh_codebook()?;
+        Ok(trainer)
+    }
+
+    /// Steps taken so far.
+    pub fn steps(&self) -> u64 {
+        self.adam.steps()
+    }
+
+    /// The weights, by name.
+    ///
+    /// # Errors
+    /// When the variables' lock is poisoned.
+    pub fn weights(&self) -> Result<Tensors> {
+        let vars = self.vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        Ok(vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor())).collect())
+    }
+
+    /// The network as it is now.
+    pub fn network(&self) -> &RetargetNetwork {
+        &self.network
+    }
+
+    fn set_vars(&self, tensors: &std::collections::HashMap<String, Tensor>) -> Result<()> {
+        let vars = self.vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        for (name, var) in vars.iter() {
+            let tensor = tensors.get(name).with_context(|| format!("no tensor `{name}`"))?;
+            var.set(tensor).with_context(|| format!("tensor `{name}`"))?;
+        }
+        Ok(())
+    }
+
+    /// Writes network, optimiser and progress.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn save_run(&self, path: &Path) -> Result<()> {
+        let mut tensors = self.weights()?;
+        tensors.extend(self.adam.state()?);
+        tensors.insert("usage".to_owned(), Tensor::new(self.usage.as_slice(), &Device::Cpu)?);
+        let mut metadata = CheckpointMetadata::for_goal_joints(RUN_KIND, &self.robot);
+        metadata.config = serde_json::to_value(NetworkConfig::default())?;
+        metadata.training =
+            serde_json::to_value(Progress { settings: self.settings.clone(), step: self.steps() })?;
+        checkpoint::save(path, metadata, &tensors)?;
+        Ok(())
+    }
+
+    /// Writes the weights as f16, for serving.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn export(&self, path: &Path, data: &serde_json::Value) -> Result<CheckpointMetadata> {
+        let mut metadata = CheckpointMetadata::for_goal_joints(retarget::KIND, &self.robot);
+        metadata.config = serde_json::to_value(NetworkConfig::default())?;
+        metadata.git_revision = run::git_revision();
+        metadata.training = serde_json::json!({
+            "command": "emp-train retargeter",
+            "settings": self.settings,
+            "step": self.steps(),
+            "recorded_motion": data,
+        });
+        let half = |(name, tensor): (String, Tensor)| Ok((name, tensor.to_dtype(DType::F16)?));
+        let tensors = self.weights()?.into_iter().map(half).collect::<Result<Tensors>>()?;
+        Ok(checkpoint::save(path, metadata, &tensors)?)
+    }
+
+    /// Takes one step on a batch that depends on nothing but the seed and the step's number.
+    fn step(&mut self, dataset: &Dataset) -> Result<Step> {
+        let step = self.steps();
+        let mut rng = step_rng(self.settings.seed, step);
+        let targets: Vec<Target> = (0..self.settings.batch).map(|_| dataset.sample(&mut rng)).collect();
+        let decoded = self.forward(&targets)?;
+        if step == 0 {
+            self.replace_codes(&decoded.latent, |_| true, &mut rng)?;
+        }
+        let terms = self.loss.terms(&decoded, &TargetBatch::new(&targets)?)?;
+        let total = terms.total()?;
+        let gradient_norm = self.adam.step(&total.backward()?, self.learning_rate(step))?;
+        for index in &decoded.indices {
+            self.usage[*index as usize] += 1.0;
+        }
+        // Late in the run the codebook is left alone, for the decoder to settle on it.
+        if (step + 1).is_multiple_of(CODE_WINDOW) && step < self.settings.steps * 7 / 10 {
+            let usage = std::mem::replace(&mut self.usage, vec![0.0; self.network.codes()]);
+            self.replace_codes(&decoded.latent, |code| usage[code] == 0.0, &mut rng)?;
+        }
+        self.network.refresh_codebook()?;
+        Ok(Step {
+            total: f64::from(total.to_scalar::<f32>()?),
+            terms: terms.values()?,
+            gradient_norm,
+            perplexity: perplexity(&decoded.indices, self.network.codes()),
+        })
+    }
+
+    fn forward(&self, targets: &[Target]) -> Result<Decoded> {
+        let mut features = Vec::with_capacity(targets.len() * KEY_NODES * NODE_FEATURES);
+        for target in targets {
+            target.write_features(&mut features);
+        }
+        let features = Tensor::from_vec(features, (targets.len(), KEY_NODES, NODE_FEATURES), &Device::Cpu)?;
+        Ok(self.network.forward(&features)?)
+    }
+
+    /// Moves the codes that `dead` names onto random latent vectors of the batch, and forgets their moments.
+    fn replace_codes(&mut self, latent: &Tensor, dead: impl Fn(usize) -> bool, rng: &mut ChaCha8Rng) -> Result<()> {
+        let codes: Vec<usize> = (0..self.network.codes()).filter(|code| dead(*code)).collect();
+        if codes.is_empty() {
+            return Ok(());
+        }
+        let (rows, width) = latent.dims2()?;
+        let latent = latent.flatten_all()?.to_vec1::<f32>()?;
+        let vars = self.vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        let codebook = vars.get("codebook").context("no variable `codebook`")?;
+        let mut values = codebook.flatten_all()?.to_vec1::<f32>()?;
+        for code in &codes {
+            let row = rng.random_range(0..rows);
+            values[code * width..(code + 1) * width].copy_from_slice(&latent[row * width..(row + 1) * width]);
+        }
+        codebook.set(&Tensor::from_vec(values, codebook.shape(), &Device::Cpu)?)?;
+        drop(vars);
+        let codes: Vec<u32> = codes.into_iter().map(|code| code as u32).collect();
+        self.adam.forget_rows("codebook", &codes);
+        Ok(())
+    }
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        const WARM_UP: f64 = 200.0;
+        const LAST: f64 = 0.01;
+        let progress = step as f64 / self.settings.steps as f64;
+        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * progress).cos());
+        let warm_up = ((step + 1) as f64 / WARM_UP).min(1.0);
+        self.settings.learning_rate * warm_up * (LAST + (1.0 - LAST) * cosine)
+    }
+}
+
+/// What a run's checkpoint says of its progress.
+#[derive(Serialize, Deserialize)]
+struct Progress {
+    settings: Settings,
+    step: u64,
+}
+
+/// Candle draws initial weights from a generator that cannot be seeded on the CPU; they are drawn anew here, uniformly
+/// within `±1/√inputs`.
+fn initialise(vars: &VarMap, seed: u64) -> Result<()> {
+    let vars = vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+    let mut names: Vec<&String> = vars.keys().collect();
+    names.sort();
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    for name in names {
+        let var = &vars[name];
+        let weight = name.strip_suffix("bias").map(|stem| format!("{stem}weight"));
+        let shape = weight.and_then(|weight| vars.get(&weight)).unwrap_or(var).dims();
+        let bound = 1.0 / (*shape.last().unwrap_or(&1) as f32).sqrt();
+        let values: Vec<f32> = (0..var.elem_count()).map(|_| rng.random_range(-bound..bound)).collect();
+        var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu)?)?;
+    }
+    Ok(())
+}
+
+fn step_rng(seed: u64, step: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    // Stream 0 drew the initial weights.
+    rng.set_stream(step + 1);
+    rng
+}
+
+/// `exp(H)` of the codes' frequencies: how many codes are in use, as it were.
+pub fn perplexity(indices: &[u32], codes: usize) -> f64 {
+    let mut counts = vec![0u64; codes];
+    for index in indices {
+        counts[*index as usize] += 1;
+    }
+    let total = indices.len().max(1) as f64;
+    let shares = counts.iter().filter(|count| **count > 0).map(|count| *count as f64 / total);
+    shares.map(|p| -p * p.ln()).sum::<f64>().exp()
+}
+
+/// Where a run keeps its state, and what it leaves.
+pub struct RunFiles {
+    /// Folder of the checkpoint and the log.
+    pub folder: PathBuf,
+    /// The weights for serving.
+    pub weights: PathBuf,
+}
+
+impl RunFiles {
+    /// The run's checkpoint.
+    pub fn checkpoint(&self) -> PathBuf {
+        self.folder.join("checkpoint.safetensors")
+    }
+
+    /// The run's log.
+    pub fn log(&self) -> PathBuf {
+        self.folder.join("log.csv")
+    }
+}
+
+/// How a run ended.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// All steps are done and the weights are written.
+    Finished,
+    /// Interrupted; the checkpoint is written.
+    Interrupted,
+}
+
+/// Runs the trainer to its end or to an interruption, saving every two minutes.
+///
+/// # Errors
+/// When a file cannot be written, or the gradient stops being a number.
+pub fn train(
+    trainer: &mut Trainer,
+    dataset: &Dataset,
+    data_summary: &serde_json::Value,
+    files: &RunFiles,
+    interrupt: &Interrupt,
+) -> Result<Outcome> {
+    const SAVE_EVERY: Duration = Duration::from_secs(120);
+    const LOG_EVERY: u64 = 100;
+    let mut columns = vec!["step", "loss"];
+    columns.extend(Terms::NAMES);
+    columns.extend(["gradient_norm", "perplexity", "learning_rate"]);
+    let done = trainer.steps();
+    let mut log = CsvLog::open(&files.log(), &columns, (done > 0).then_some(done))?;
+    let bar = run::progress(trainer.settings.steps, done);
+    let mut saved = Instant::now();
+    while trainer.steps() < trainer.settings.steps {
+        if interrupt.requested() {
+            trainer.save_run(&files.checkpoint())?;
+            bar.abandon_with_message("interrupted; continue with --resume");
+            return Ok(Outcome::Interrupted);
+        }
+        let rate = trainer.learning_rate(trainer.steps());
+        let step = trainer.step(dataset).with_context(|| format!("step {}", trainer.steps()))?;
+        bar.set_position(trainer.steps());
+        if trainer.steps().is_multiple_of(LOG_EVERY) {
+            let mut row = vec![step.total];
+            row.extend(step.terms);
+            row.extend([step.gradient_norm, step.perplexity, rate]);
+            log.row(trainer.steps(), &row)?;
+            bar.set_message(format!("loss {:.2}", step.total));
+        }
+        if saved.elapsed() > SAVE_EVERY {
+            trainer.save_run(&files.checkpoint())?;
+            saved = Instant::now();
+        }
+    }
+    trainer.save_run(&files.checkpoint())?;
+    trainer.export(&files.weights, data_summary)?;
+    bar.finish();
+    Ok(Outcome::Finished)
+}

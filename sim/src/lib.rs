@@ -5,6 +5,17 @@
 //!
 //! This crate never speaks to a network, never learns, and draws nothing.
 //!
+//! ```
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let robot = emp_robot::Robot::load("../robots/emp27".as_ref())?;
+//! let rest: Vec<f32> = robot.goal_joints().iter().map(|joint| joint.default as f32).collect();
+//! let replay = emp_sim::replay(&robot, &vec![rest; 50])?;
+//! println!("after a second the left wrist is at {}", replay.frames[49].key_nodes[6]);
+//! assert_eq!(replay.self_collision_share(), 0.0);
+//! # Ok(())
+//! # }
+//! ```
+//!
 //! Frames: x forward, y left, z up, origin at the pelvis. Units: metres, radians, seconds.
 
 mod collision;

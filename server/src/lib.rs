@@ -1,1 +1,29 @@
-//! Placeholder until the crate's first commit.
+//! The gRPC server: it takes human poses off the wire, brings them to the models in batches, and sends joint targets
+//! back.
+//!
+//! Transport (`service`, `session`) knows messages and deadlines; the core (`batcher`, `queue`) knows neither; a model
+//! is known only through [`Backend`]. Statuses are made in `error` and nowhere else. This crate never computes a joint
+//! angle itself, and it runs no model and no foreign code on a tokio thread.
+
+#![forbid(unsafe_code)]
+
+mod backend;
+mod batcher;
+mod catalog;
+mod deadline;
+mod error;
+mod pose;
+mod queue;
+mod serve;
+mod service;
+mod session;
+mod settings;
+mod wire;
+
+pub use backend::{Backend, BackendError, BuildRetargeter, RetargetBackend};
+pub use catalog::{Catalog, CatalogError};
+pub use serve::{Drain, ServeError, Server};
+pub use settings::{
+    BatchingSettings, DEFAULT_SETTINGS, LogFormat, LogSettings, Overrides, Settings, SettingsError,
+    ShutdownSettings, StreamSettings,
+};

@@ -1,0 +1,119 @@
+//! When an answer is due: the call's `grpc-timeout` and the frame's own time budget, whichever is sooner.
+
+use std::time::{Duration, Instant};
+
+use emp_proto::v1::FrameHeader;
+use tonic::metadata::MetadataMap;
+
+use crate::error::FieldError;
+
+/// tonic answers an expired `grpc-timeout` with `CANCELLED`. Finishing this part earlier lets the server say
+/// `DEADLINE_EXCEEDED`, as the protocol wants.
+const HEAD_START: f64 = 0.02;
+/// The head start's bounds.
+const HEAD_START_BOUNDS: [Duration; 2] = [Duration::from_millis(1), Duration::from_millis(50)];
+
+/// When a call must have ended, by its `grpc-timeout`.
+pub(crate) fn of_call(
+    metadata: &MetadataMap,
+    received: Instant,
+) -> Result<Option<Instant>, FieldError> {
+    let Some(value) = metadata.get("grpc-timeout") else {
+        return Ok(None);
+    };
+    let timeout = value.to_str().ok().and_then(parse_timeout).ok_or_else(|| {
+        FieldError::new(
+            "grpc-timeout",
+            format!("{value:?}; expected up to 8 digits and one of H M S m u n"),
+        )
+    })?;
+    let head_start = timeout
+        .mul_f64(HEAD_START)
+        .clamp(HEAD_START_BOUNDS[0], HEAD_START_BOUNDS[1]);
+    Ok(received.checked_add(timeout.saturating_sub(head_start)))
+}
+
+/// When a frame's answer stops being useful, by its `time_budget`.
+pub(crate) fn of_frame(
+    header: Option<&FrameHeader>,
+    received: Instant,
+) -> Result<Option<Instant>, FieldError> {
+    let Some(budget) = header.and_then(|header| header.time_budget) else {
+        return Ok(None);
+    };
+    let budget = Duration::try_from(budget).map_err(|_| {
+        FieldError::new(
+            "header.time_budget",
+            "it is negative; expected zero or more",
+        )
+    })?;
+    Ok(received.checked_add(budget))
+}
+
+/// The sooner of two deadlines.
+pub(crate) fn sooner(a: Option<Instant>, b: Option<Instant>) -> Option<Instant> {
+    a.into_iter().chain(b).min()
+}
+
+pub(crate) fn has_passed(deadline: Option<Instant>) -> bool {
+    deadline.is_some_and(|deadline| deadline <= Instant::now())
+}
+
+/// Waits until a deadline; forever if there is none.
+pub(crate) async fn passed(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
+        None => std::future::pending().await,
+    }
+}
+
+fn parse_timeout(value: &str) -> Option<Duration> {
+    let (digits, unit) = value.split_at_checked(value.len().checked_sub(1)?)?;
+    if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|byte| byte.is_ascii_digit()) {
+        return None;
+    }
+    let count: u64 = digits.parse().ok()?;
+    match unit {
+        "H" => Some(Duration::from_secs(count * 3600)),
+        "M" => Some(Duration::from_secs(count * 60)),
+        "S" => Some(Duration::from_secs(count)),
+        "m" => Some(Duration::from_millis(count)),
+        "u" => Some(Duration::from_micros(count)),
+        "n" => Some(Duration::from_nanos(count)),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn timeouts_are_read_in_every_unit_and_nothing_else() {
+        assert_eq!(parse_timeout("2H"), Some(Duration::from_secs(7200)));
+        assert_eq!(parse_timeout("3M"), Some(Duration::from_secs(180)));
+        assert_eq!(parse_timeout("15S"), Some(Duration::from_secs(15)));
+        assert_eq!(parse_timeout("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(parse_timeout("9u"), Some(Duration::from_micros(9)));
+        assert_eq!(
+            parse_timeout("99999999n"),
+            Some(Duration::from_nanos(99_999_999))
+        );
+        for bad in ["", "m", "5", "123456789m", "-1m", "+1m", "1 m", "5x", "5ä"] {
+            assert_eq!(parse_timeout(bad), None, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn a_negative_budget_is_refused_by_name() {
+        let header = FrameHeader {
+            time_budget: Some(prost_types::Duration {
+                seconds: -1,
+                nanos: 0,
+            }),
+            ..FrameHeader::default()
+        };
+        let error = of_frame(Some(&header), Instant::now()).expect_err("negative");
+        assert_eq!(error.field, "header.time_budget");
+    }
+}

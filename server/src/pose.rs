@@ -1,0 +1,204 @@
+//! A pose off the wire: checked field by field, then as a body.
+
+use emp_motion::{FrameError, KEY_NODES, KeyNode, KeyNodeFrame};
+use emp_proto::v1::{HumanPose, Position, Quaternion};
+use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+
+use crate::error::FieldError;
+
+/// How far a quaternion's length may be from 1.
+const QUATERNION_TOLERANCE: f32 = 0.01;
+
+/// Reads a pose and moves its origin to the waist. Field paths start at the message that holds `pose`.
+pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError> {
+    let pose = pose.ok_or_else(|| FieldError::new("pose", "it is missing"))?;
+    let nodes = nodes(pose);
+    let given = nodes.iter().flatten().count();
+    let mut positions = [Vector3::zeros(); KEY_NODES];
+    for (node, position) in KeyNode::ALL.into_iter().zip(nodes) {
+        let position = position.ok_or_else(|| {
+            let description =
+                format!("it is missing; a pose has {KEY_NODES} key nodes, this one {given}");
+            FieldError::new(path(node.name()), description)
+        })?;
+        positions[node as usize] = read_position(node.name(), position)?;
+    }
+    let waist = positions[KeyNode::Waist as usize];
+    for position in &mut positions {
+        *position -= waist;
+    }
+    let wrist_rotations = [
+        read_rotation(
+            "left_wrist_orientation",
+            pose.left_wrist_orientation.as_ref(),
+        )?,
+        read_rotation(
+            "right_wrist_orientation",
+            pose.right_wrist_orientation.as_ref(),
+        )?,
+    ];
+    let frame = KeyNodeFrame {
+        positions,
+        wrist_rotations,
+    };
+    frame
+        .validate()
+        .map_err(|error| FieldError::new(field_of(&error), error.to_string()))?;
+    Ok(frame)
+}
+
+/// The key nodes of a message, in the order of [`KeyNode::ALL`].
+fn nodes(pose: &HumanPose) -> [Option<&Position>; KEY_NODES] {
+    [
+        pose.waist.as_ref(),
+        pose.torso.as_ref(),
+        pose.left_shoulder.as_ref(),
+        pose.right_shoulder.as_ref(),
+        pose.left_elbow.as_ref(),
+        pose.right_elbow.as_ref(),
+        pose.left_wrist.as_ref(),
+        pose.right_wrist.as_ref(),
+    ]
+}
+
+fn path(name: &str) -> String {
+    format!("pose.{name}")
+}
+
+fn read_position(name: &str, position: &Position) -> Result<Vector3<f32>, FieldError> {
+    let Position { x, y, z } = *position;
+    check_finite(name, [("x", x), ("y", y), ("z", z)])?;
+    Ok(Vector3::new(x, y, z))
+}
+
+fn read_rotation(
+    name: &str,
+    quaternion: Option<&Quaternion>,
+) -> Result<Option<Rotation3<f32>>, FieldError> {
+    let Some(&Quaternion { w, x, y, z }) = quaternion else {
+        return Ok(None);
+    };
+    check_finite(name, [("w", w), ("x", x), ("y", y), ("z", z)])?;
+    let quaternion = nalgebra::Quaternion::new(w, x, y, z);
+    let length = quaternion.norm();
+    if (length - 1.0).abs() > QUATERNION_TOLERANCE {
+        return Err(FieldError::new(
+            path(name),
+            format!("a quaternion of length {length}; expected length 1"),
+        ));
+    }
+    Ok(Some(
+        UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix(),
+    ))
+}
+
+fn check_finite<const N: usize>(name: &str, values: [(&str, f32); N]) -> Result<(), FieldError> {
+    match values.into_iter().find(|(_, value)| !value.is_finite()) {
+        Some((axis, value)) => Err(FieldError::new(
+            format!("{}.{axis}", path(name)),
+            format!("{value}; expected a finite number"),
+        )),
+        None => Ok(()),
+    }
+}
+
+fn field_of(error: &FrameError) -> String {
+    match error {
+        FrameError::NotFinite { node }
+        | FrameError::TooFar { node, .. }
+        | FrameError::EmptyBone { node, .. } => path(node),
+        FrameError::NotARotation { side } => path(&format!("{side}_wrist_orientation")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn position(x: f32, y: f32, z: f32) -> Option<Position> {
+        Some(Position { x, y, z })
+    }
+
+    /// Arms hanging, one metre above a free origin.
+    fn pose() -> HumanPose {
+        HumanPose {
+            waist: position(0.0, 0.0, 1.0),
+            torso: position(0.0, 0.0, 1.45),
+            left_shoulder: position(0.0, 0.2, 1.4),
+            right_shoulder: position(0.0, -0.2, 1.4),
+            left_elbow: position(0.0, 0.25, 1.1),
+            right_elbow: position(0.0, -0.25, 1.1),
+            left_wrist: position(0.1, 0.25, 0.9),
+            right_wrist: position(0.1, -0.25, 0.9),
+            left_wrist_orientation: Some(Quaternion {
+                w: 1.0,
+                x: 0.0,
+                y: 0.0,
+                z: 0.0,
+            }),
+            right_wrist_orientation: None,
+        }
+    }
+
+    fn refused(change: impl FnOnce(&mut HumanPose)) -> FieldError {
+        let mut pose = pose();
+        change(&mut pose);
+        read(Some(&pose)).expect_err("refused")
+    }
+
+    #[test]
+    fn the_origin_moves_to_the_waist() {
+        let frame = read(Some(&pose())).expect("a good pose");
+        assert_eq!(frame.positions[0], Vector3::zeros());
+        assert!(
+            (frame.positions[KeyNode::LeftWrist as usize] - Vector3::new(0.1, 0.25, -0.1)).norm()
+                < 1e-6
+        );
+        assert_eq!(frame.wrist_rotations, [Some(Rotation3::identity()), None]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        assert_eq!(read(None).expect_err("refused").field, "pose");
+        let missing = refused(|pose| pose.right_elbow = None);
+        assert_eq!(missing.field, "pose.right_elbow");
+        assert!(missing.description.contains("this one 7"), "{missing}");
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let error = refused(|pose| pose.left_wrist = position(0.1, value, 0.0));
+            assert_eq!(error.field, "pose.left_wrist.y");
+        }
+        let far = refused(|pose| pose.left_elbow = position(1e30, 0.0, 0.0));
+        assert_eq!(far.field, "pose.left_elbow");
+        let bone = refused(|pose| pose.left_elbow = pose.left_shoulder);
+        assert_eq!(bone.field, "pose.left_elbow");
+        let long = refused(|pose| {
+            pose.right_wrist_orientation = Some(Quaternion {
+                w: 1.0,
+                x: 0.5,
+                y: 0.0,
+                z: 0.0,
+            });
+        });
+        assert_eq!(long.field, "pose.right_wrist_orientation");
+        let zero = refused(|pose| pose.left_wrist_orientation = Some(Quaternion::default()));
+        assert_eq!(zero.field, "pose.left_wrist_orientation");
+        let nan = refused(|pose| {
+            pose.left_wrist_orientation = Some(Quaternion {
+                w: f32::NAN,
+                x: 0.0,
+                y: 0.0,
+                z: 0.0,
+            });
+        });
+        assert_eq!(nan.field, "pose.left_wrist_orientation.w");
+    }
+
+    #[test]
+    fn distances_that_overflow_are_refused() {
+        let error = refused(|pose| {
+            pose.waist = position(f32::MAX, 0.0, 0.0);
+            pose.torso = position(f32::MIN, 0.0, 0.0);
+        });
+        assert!(error.field.starts_with("pose."), "{error}");
+    }
+}

@@ -1,0 +1,194 @@
+//! The server around the services: listening, health, reflection, and the end.
+
+use std::{collections::BTreeSet, net::SocketAddr, sync::Arc, time::Duration};
+
+use emp_proto::{
+    FILE_DESCRIPTOR_SET,
+    v1::{model_service_server::ModelServiceServer, motion_service_server::MotionServiceServer},
+};
+use tokio::{net::TcpListener, time::timeout};
+use tokio_stream::{StreamExt as _, StreamMap, wrappers::WatchStream};
+use tokio_util::sync::CancellationToken;
+use tonic::transport::{Server as Transport, server::TcpIncoming};
+use tonic_health::{ServingStatus, server::HealthReporter};
+
+use crate::{
+    batcher::ModelState,
+    catalog::Catalog,
+    service::{Models, Motion},
+    settings::Settings,
+};
+
+/// Names of the services in `grpc.health.v1`; the empty one is the whole server.
+const MOTION: &str = "emp.v1.MotionService";
+const MODELS: &str = "emp.v1.ModelService";
+const WHOLE: &str = "";
+
+/// A silent connection is asked after this long, and closed when it does not answer in time.
+const KEEPALIVE: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(5)];
+/// Largest message of the services here: one pose takes about 200 bytes.
+const MAX_MESSAGE: usize = 256 << 10;
+/// Streams that a client may reset before they were accepted. h2's own 20 is too few for a client that cancels many
+/// calls at once; it would lose its connection.
+const MAX_RESETS: usize = 1_000;
+
+/// A server that listens and is ready to run.
+pub struct Server {
+    listener: TcpListener,
+    address: SocketAddr,
+    catalog: Arc<Catalog>,
+    settings: Settings,
+}
+
+/// Why the server could not start or had to stop.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The address cannot be listened on.
+    #[error("listen on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The descriptors do not make a reflection service.
+    #[error("reflection: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+    /// The transport failed.
+    #[error("transport: {0}")]
+    Transport(#[from] tonic::transport::Error),
+}
+
+/// How a server ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Drain {
+    /// Every call ended by itself.
+    Complete,
+    /// The grace time ran out with calls still open; they were cut off.
+    CutOff,
+}
+
+impl Server {
+    /// Binds the address of the settings; port 0 takes a free one.
+    ///
+    /// # Errors
+    /// When the address is taken or not this machine's.
+    pub async fn bind(settings: Settings, catalog: Catalog) -> Result<Self, ServeError> {
+        let address = settings.listen;
+        let listening = async {
+            let listener = TcpListener::bind(address).await?;
+            let address = listener.local_addr()?;
+            Ok((listener, address))
+        };
+        let (listener, address) = listening
+            .await
+            .map_err(|source| ServeError::Listen { address, source })?;
+        Ok(Self {
+            listener,
+            address,
+            catalog: Arc::new(catalog),
+            settings,
+        })
+    }
+
+    /// The address that clients reach.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Serves until `shutdown` is cancelled; then streams answer what waits and end, and after the grace time
+    /// whatever is left is cut off.
+    ///
+    /// # Errors
+    /// When the transport fails.
+    pub async fn run(self, shutdown: CancellationToken) -> Result<Drain, ServeError> {
+        let (reporter, health) = tonic_health::server::health_reporter();
+        for service in [WHOLE, MOTION, MODELS] {
+            reporter
+                .set_service_status(service, ServingStatus::Serving)
+                .await;
+        }
+        tokio::spawn(report_models(
+            Arc::clone(&self.catalog),
+            reporter.clone(),
+            shutdown.clone(),
+        ));
+
+        let reflect = || {
+            tonic_reflection::server::Builder::configure()
+                .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
+                .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        };
+        let motion = Motion::new(
+            Arc::clone(&self.catalog),
+            &self.settings.streams,
+            shutdown.clone(),
+        );
+        let models = Models::new(Arc::clone(&self.catalog));
+        let incoming = TcpIncoming::from(self.listener).with_nodelay(Some(true));
+        let serving = Transport::builder()
+            .trace_fn(|request| tracing::info_span!("call", path = request.uri().path()))
+            .http2_keepalive_interval(Some(KEEPALIVE[0]))
+            .http2_keepalive_timeout(Some(KEEPALIVE[1]))
+            .http2_max_pending_accept_reset_streams(Some(MAX_RESETS))
+            .add_service(health)
+            .add_service(reflect().build_v1()?)
+            .add_service(reflect().build_v1alpha()?)
+            .add_service(MotionServiceServer::new(motion).max_decoding_message_size(MAX_MESSAGE))
+            .add_service(ModelServiceServer::new(models).max_decoding_message_size(MAX_MESSAGE))
+            .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
+        tokio::pin!(serving);
+
+        tokio::select! {
+            ended = &mut serving => return ended.map(|()| Drain::Complete).map_err(Into::into),
+            () = shutdown.cancelled() => {}
+        }
+        tracing::info!(grace = ?self.settings.grace(), "draining");
+        close_health(reporter).await;
+        match timeout(self.settings.grace(), serving).await {
+            Ok(ended) => ended.map(|()| Drain::Complete).map_err(Into::into),
+            Err(_) => Ok(Drain::CutOff),
+        }
+    }
+}
+
+/// Keeps the motion service's health at that of its models, until the server shuts down.
+async fn report_models(
+    catalog: Arc<Catalog>,
+    reporter: HealthReporter,
+    shutdown: CancellationToken,
+) {
+    let models = catalog
+        .retargeters()
+        .map(|model| (model.card.name.clone(), model.batcher.state()));
+    let mut changes: StreamMap<_, _> = models
+        .map(|(name, state)| (name, WatchStream::new(state)))
+        .collect();
+    let mut failed = BTreeSet::new();
+    loop {
+        let (model, state) = tokio::select! {
+            Some(change) = changes.next() => change,
+            () = shutdown.cancelled() => return,
+        };
+        match state {
+            ModelState::Serving => failed.remove(&model),
+            ModelState::Rebuilding => failed.insert(model),
+        };
+        let status = if failed.is_empty() {
+            ServingStatus::Serving
+        } else {
+            ServingStatus::NotServing
+        };
+        reporter.set_service_status(MOTION, status).await;
+    }
+}
+
+/// Tells those who watch that the server goes, and ends their watches, which would hold it up otherwise.
+async fn close_health(mut reporter: HealthReporter) {
+    for service in [WHOLE, MOTION, MODELS] {
+        reporter
+            .set_service_status(service, ServingStatus::NotServing)
+            .await;
+        reporter.clear_service_status(service).await;
+    }
+}

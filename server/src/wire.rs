@@ -1,0 +1,96 @@
+//! The server's own values as messages.
+
+use std::time::Duration;
+
+use emp_models::{
+    CheckpointMetadata,
+    retarget::{AT_LIMIT, RetargetOutput},
+};
+use emp_proto::v1;
+use emp_robot::{Joint, Robot};
+
+use crate::queue::Answer;
+
+pub(crate) fn timing(answer: &Answer<RetargetOutput>) -> v1::Timing {
+    v1::Timing {
+        queue_time: Some(duration(answer.queue_time)),
+        inference_time: Some(duration(answer.inference_time)),
+        batch_size: u32::try_from(answer.batch_size).unwrap_or(u32::MAX),
+    }
+}
+
+/// `angles` are the final ones, in goal order; smoothing may have moved them off the model's.
+pub(crate) fn retarget_result(
+    robot: &Robot,
+    angles: Vec<f32>,
+    direction_error: f32,
+) -> v1::RetargetResult {
+    let joints_at_limit = robot
+        .goal_joints()
+        .iter()
+        .zip(&angles)
+        .filter(|(joint, angle)| stands_at_limit(joint, f64::from(**angle)))
+        .map(|(joint, _)| joint.name.clone())
+        .collect();
+    v1::RetargetResult {
+        joint_angles: angles,
+        direction_error,
+        joints_at_limit,
+    }
+}
+
+fn stands_at_limit(joint: &Joint, angle: f64) -> bool {
+    let [lower, upper] = joint.range;
+    angle <= lower + AT_LIMIT || angle >= upper - AT_LIMIT
+}
+
+pub(crate) fn model_card(name: String, metadata: &CheckpointMetadata) -> v1::Model {
+    v1::Model {
+        name,
+        version: metadata.version().to_owned(),
+        kind: v1::ModelKind::Retargeter.into(),
+        robot: metadata.robot.clone(),
+        joint_names: metadata.joints.clone(),
+        weights_sha256: metadata.sha256.clone(),
+        git_revision: metadata.git_revision.clone(),
+        training: metadata.training.to_string(),
+    }
+}
+
+pub(crate) fn robot(robot: &Robot) -> v1::Robot {
+    let key_nodes = robot.key_nodes().iter().map(|site| {
+        let [offset_x, offset_y, offset_z] = site.offset;
+        v1::KeyNode {
+            name: site.name.to_owned(),
+            body: site.body.clone(),
+            offset_x,
+            offset_y,
+            offset_z,
+        }
+    });
+    v1::Robot {
+        name: robot.name().to_owned(),
+        goal_joints: robot.goal_joints().iter().map(joint).collect(),
+        leg_joints: robot.leg_joints().iter().map(joint).collect(),
+        control_rate: robot.control_rate_hz(),
+        key_nodes: key_nodes.collect(),
+    }
+}
+
+fn joint(joint: &Joint) -> v1::Joint {
+    v1::Joint {
+        name: joint.name.clone(),
+        lower_limit: joint.range[0],
+        upper_limit: joint.range[1],
+        default_angle: joint.default,
+        kp: joint.kp,
+        kd: joint.kd,
+        torque_limit: joint.torque_limit,
+        velocity_limit: joint.velocity_limit,
+    }
+}
+
+fn duration(duration: Duration) -> prost_types::Duration {
+    // Only durations of more than 2^63 seconds do not fit.
+    prost_types::Duration::try_from(duration).unwrap_or_default()
+}

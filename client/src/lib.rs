@@ -1,1 +1,47 @@
-//! Placeholder until the crate's first commit.
+//! The client library: human poses go to a server of `emp.v1`, joint targets come back, by single calls or as a stream
+//! that survives a lost connection.
+//!
+//! It links neither MuJoCo nor candle and computes no joint angle: it installs in a minute on an operator's laptop.
+//!
+//! ```no_run
+//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
+//! use emp_client::{Client, Delivery, Event, StreamConfig};
+//!
+//! let client = Client::connect("http://127.0.0.1:50051").await?;
+//! let config = StreamConfig { delivery: Delivery::All, ..StreamConfig::for_robot("emp27") };
+//! let (mut sender, mut events) = client.stream(config).await?;
+//! let clip = emp_motion::load("motion.bvh".as_ref())?.resampled(50.0);
+//! tokio::spawn(async move {
+//!     for frame in &clip.frames {
+//!         if sender.send(frame, None).await.is_err() {
+//!             break;
+//!         }
+//!     } // Dropping the sender half-closes the stream: what is on its way is still answered.
+//! });
+//! while let Some(event) = events.next().await? {
+//!     if let Event::Answer(answer) = event {
+//!         println!("{}: {:?}", answer.sequence_number, answer.joint_angles);
+//!     }
+//! }
+//! # Ok(())
+//! # }
+//! ```
+
+#![forbid(unsafe_code)]
+
+mod backoff;
+mod client;
+mod driver;
+mod error;
+mod statistics;
+mod stream;
+mod wire;
+
+pub use backoff::Backoff;
+pub use client::Client;
+pub use emp_proto::v1::{Delivery, DropReason, Joint, KeyNode, Model, Robot};
+pub use error::ClientError;
+pub use statistics::{BatchStatistics, DirectionError, Percentiles, Statistics, Summary};
+pub use stream::{
+    Answer, DropCause, Dropped, Event, FrameSender, StreamClosed, StreamConfig, StreamEvents,
+};

@@ -1,0 +1,149 @@
+//! A connection and its single calls.
+
+use std::time::{Duration, Instant};
+
+use emp_motion::KeyNodeFrame;
+use emp_proto::v1::{
+    GetModelRequest, GetRobotRequest, ListModelsRequest, Model, RetargetRequest, Robot,
+    model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
+};
+use tonic::transport::{Channel, Endpoint};
+
+use crate::{Answer, Backoff, ClientError, FrameSender, StreamConfig, StreamEvents, driver, wire};
+
+/// How long a connection may take to stand.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// A silent connection is asked after this long, and given up when it does not answer in time.
+const KEEPALIVE: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(5)];
+
+/// A client of one server. Cheap to clone; clones share the connection, which comes back by itself.
+#[derive(Debug, Clone)]
+pub struct Client {
+    channel: Channel,
+    backoff: Backoff,
+}
+
+impl Client {
+    /// Connects to a server, for example `http://127.0.0.1:50051`.
+    ///
+    /// # Errors
+    /// When the URL is none or nothing answers there.
+    pub async fn connect(url: &str) -> Result<Self, ClientError> {
+        let failed = |error: tonic::transport::Error| ClientError::Connect {
+            url: url.to_owned(),
+            reason: root_cause(&error),
+        };
+        let endpoint = Endpoint::from_shared(url.to_owned())
+            .map_err(failed)?
+            .connect_timeout(CONNECT_TIMEOUT)
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(KEEPALIVE[0])
+            .keep_alive_timeout(KEEPALIVE[1])
+            .keep_alive_while_idle(true);
+        let channel = endpoint.connect().await.map_err(failed)?;
+        Ok(Self {
+            channel,
+            backoff: Backoff::default(),
+        })
+    }
+
+    /// The same client with other pauses between attempts to restore a stream's connection.
+    #[must_use]
+    pub fn with_backoff(self, backoff: Backoff) -> Self {
+        Self { backoff, ..self }
+    }
+
+    /// Every model that the server has.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn models(&self) -> Result<Vec<Model>, ClientError> {
+        let response = self.model_service().list_models(ListModelsRequest {}).await;
+        Ok(response.map_err(ClientError::Status)?.into_inner().models)
+    }
+
+    /// One model.
+    ///
+    /// # Errors
+    /// When the call fails, with NOT_FOUND for an unknown name.
+    pub async fn model(&self, name: &str) -> Result<Model, ClientError> {
+        let response = self
+            .model_service()
+            .get_model(GetModelRequest {
+                name: name.to_owned(),
+            })
+            .await;
+        let model = response.map_err(ClientError::Status)?.into_inner().model;
+        model.ok_or(ClientError::Contract("GetModel without a model"))
+    }
+
+    /// One robot.
+    ///
+    /// # Errors
+    /// When the call fails, with NOT_FOUND for an unknown name.
+    pub async fn robot(&self, name: &str) -> Result<Robot, ClientError> {
+        let response = self
+            .model_service()
+            .get_robot(GetRobotRequest {
+                name: name.to_owned(),
+            })
+            .await;
+        let robot = response.map_err(ClientError::Status)?.into_inner().robot;
+        robot.ok_or(ClientError::Contract("GetRobot without a robot"))
+    }
+
+    /// Retargets one pose for a robot, with the robot's own model. The answer's number is 0.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn retarget(
+        &self,
+        robot: &str,
+        pose: &KeyNodeFrame,
+        refine: bool,
+    ) -> Result<Answer, ClientError> {
+        let request = RetargetRequest {
+            header: Some(wire::header(0, None)),
+            robot: robot.to_owned(),
+            refine,
+            pose: Some(wire::pose(pose)),
+            ..RetargetRequest::default()
+        };
+        let sent = Instant::now();
+        let response = self.motion_service().retarget(request).await;
+        let response = response.map_err(ClientError::Status)?.into_inner();
+        let result = response
+            .result
+            .ok_or(ClientError::Contract("Retarget without a result"))?;
+        Ok(wire::answer(0, result, response.timing, sent.elapsed()))
+    }
+
+    /// Opens a stream of poses. A lost connection is restored with backoff: with delivery `ALL` whatever was not answered
+    /// is sent again, with `LATEST` it is dropped.
+    ///
+    /// # Errors
+    /// When the server refuses the stream.
+    pub async fn stream(
+        &self,
+        config: StreamConfig,
+    ) -> Result<(FrameSender, StreamEvents), ClientError> {
+        driver::start(self.motion_service(), config, self.backoff).await
+    }
+
+    fn motion_service(&self) -> MotionServiceClient<Channel> {
+        MotionServiceClient::new(self.channel.clone())
+    }
+
+    fn model_service(&self) -> ModelServiceClient<Channel> {
+        ModelServiceClient::new(self.channel.clone())
+    }
+}
+
+/// The last link of an error's chain, which is the system's own word.
+fn root_cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    cause.to_string()
+}

@@ -1,0 +1,46 @@
+//! `emp`: human motion files in, robot joint targets out, by way of a server.
+
+#![forbid(unsafe_code)]
+
+mod cli;
+mod report;
+mod retarget;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+
+use crate::cli::{Arguments, Command};
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    tracing_subscriber::fmt()
+        .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
+        .with_writer(std::io::stderr)
+        .init();
+    let runtime = match tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+    {
+        Ok(runtime) => runtime,
+        Err(error) => return failure(&error.into()),
+    };
+    match runtime.block_on(run(arguments)) {
+        Ok(code) => code,
+        Err(error) => failure(&error),
+    }
+}
+
+fn failure(error: &anyhow::Error) -> ExitCode {
+    eprintln!("emp: {error:#}");
+    ExitCode::FAILURE
+}
+
+async fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
+    let client = emp_client::Client::connect(&arguments.server).await?;
+    match arguments.command {
+        Command::Retarget(command) => retarget::run(&client, &command, arguments.json).await,
+        Command::Robots => report::robots(&client, arguments.json).await,
+        Command::Models => report::models(&client, arguments.json).await,
+    }
+}

@@ -1,0 +1,107 @@
+//! What the server has, as tables or JSON.
+
+use std::{collections::BTreeSet, process::ExitCode};
+
+use emp_client::{Client, Joint, Model, Robot};
+use serde_json::{Value, json};
+
+pub(crate) async fn models(client: &Client, as_json: bool) -> anyhow::Result<ExitCode> {
+    let models = client.models().await?;
+    if as_json {
+        println!("{}", Value::from_iter(models.iter().map(model_json)));
+    } else {
+        println!("{:<24} {:<14} {:<10} joints", "model", "version", "robot");
+        for model in &models {
+            let joints = model.joint_names.len();
+            println!(
+                "{:<24} {:<14} {:<10} {joints}",
+                model.name, model.version, model.robot
+            );
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+pub(crate) async fn robots(client: &Client, as_json: bool) -> anyhow::Result<ExitCode> {
+    let names: BTreeSet<String> = client
+        .models()
+        .await?
+        .into_iter()
+        .map(|model| model.robot)
+        .collect();
+    let mut robots = Vec::new();
+    for name in names {
+        robots.push(client.robot(&name).await?);
+    }
+    if as_json {
+        println!("{}", Value::from_iter(robots.iter().map(robot_json)));
+    } else {
+        robots.iter().for_each(print_robot);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn print_robot(robot: &Robot) {
+    let (goal, legs) = (robot.goal_joints.len(), robot.leg_joints.len());
+    println!(
+        "{}: {goal} goal joints, {legs} leg joints, {} Hz",
+        robot.name, robot.control_rate
+    );
+    println!(
+        "  {:<28} {:>8} {:>8} {:>8}",
+        "goal joint (rad)", "lower", "upper", "default"
+    );
+    for joint in &robot.goal_joints {
+        let Joint {
+            name,
+            lower_limit,
+            upper_limit,
+            default_angle,
+            ..
+        } = joint;
+        println!("  {name:<28} {lower_limit:>8.3} {upper_limit:>8.3} {default_angle:>8.3}");
+    }
+}
+
+fn model_json(model: &Model) -> Value {
+    // The server sends JSON here; anything else stands as it is.
+    let training = serde_json::from_str(&model.training).unwrap_or_else(|_| json!(model.training));
+    json!({
+        "name": model.name,
+        "version": model.version,
+        "kind": model.kind().as_str_name().trim_start_matches("MODEL_KIND_").to_lowercase(),
+        "robot": model.robot,
+        "joint_names": model.joint_names,
+        "weights_sha256": model.weights_sha256,
+        "git_revision": model.git_revision,
+        "training": training,
+    })
+}
+
+fn robot_json(robot: &Robot) -> Value {
+    let key_nodes = robot.key_nodes.iter().map(|node| {
+        json!({ "name": node.name, "body": node.body, "offset": [node.offset_x, node.offset_y, node.offset_z] })
+    });
+    json!({
+        "name": robot.name,
+        "control_rate": robot.control_rate,
+        "goal_joints": joints_json(&robot.goal_joints),
+        "leg_joints": joints_json(&robot.leg_joints),
+        "key_nodes": Value::from_iter(key_nodes),
+    })
+}
+
+fn joints_json(joints: &[Joint]) -> Value {
+    Value::from_iter(joints.iter().map(|joint| {
+        json!({
+            "name": joint.name,
+            "lower_limit": joint.lower_limit,
+            "upper_limit": joint.upper_limit,
+            "default_angle": joint.default_angle,
+            "kp": joint.kp,
+            "kd": joint.kd,
+            "torque_limit": joint.torque_limit,
+            "velocity_limit": joint.velocity_limit,
+        })
+    }))
+}

@@ -1,0 +1,191 @@
+//! `emp retarget`: a motion file through a stream into a CSV table.
+
+use std::{process::ExitCode, time::Duration};
+
+use anyhow::Context as _;
+use emp_client::{
+    Client, ClientError, Delivery, Event, FrameSender, Percentiles, Statistics, StreamConfig,
+    StreamEvents, Summary,
+};
+use emp_motion::{Clip, joint_csv::JointCsvWriter};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use tokio::time::MissedTickBehavior;
+
+use crate::cli::Retarget;
+
+const INTERRUPTED: u8 = 130;
+const FRAMES_MISSING: u8 = 3;
+
+/// How a stream ended.
+enum End {
+    Complete,
+    Interrupted,
+    Failed(ClientError),
+}
+
+pub(crate) async fn run(
+    client: &Client,
+    command: &Retarget,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let file = command.file.clone();
+    // Large recordings take seconds to parse.
+    let clip = tokio::task::spawn_blocking(move || emp_motion::load(&file)).await??;
+    let rate = client.robot(&command.robot).await?.control_rate;
+    let clip = clip.resampled(rate);
+    let config = StreamConfig {
+        delivery: if command.realtime {
+            Delivery::Latest
+        } else {
+            Delivery::All
+        },
+        refine: command.refine,
+        smoothing: command.smooth,
+        ..StreamConfig::for_robot(&command.robot)
+    };
+    let (sender, mut events) = client.stream(config).await?;
+    let mut table = JointCsvWriter::create(&command.out, events.joint_names())?;
+    let bar = progress_bar(clip.frames.len());
+    let mut statistics = Statistics::new();
+    let frames = clip.frames.len() as u64;
+    let pace = command
+        .realtime
+        .then(|| Duration::from_secs_f64(1.0 / rate));
+    tokio::spawn(send(clip, sender, pace));
+
+    let end = receive(&mut events, &mut statistics, &mut table, rate, &bar).await?;
+    table.finish()?;
+    bar.finish_and_clear();
+    let summary = statistics.summary();
+    if json {
+        println!("{}", serde_json::to_string(&summary).context("summary")?);
+    } else {
+        print_summary(&summary, command);
+    }
+    Ok(match end {
+        End::Failed(error) => return Err(error.into()),
+        End::Interrupted => ExitCode::from(INTERRUPTED),
+        End::Complete if !command.realtime && summary.answered < frames => {
+            ExitCode::from(FRAMES_MISSING)
+        }
+        End::Complete => ExitCode::SUCCESS,
+    })
+}
+
+/// Sends every frame, as fast as the stream takes them or at the pace given.
+async fn send(clip: Clip, mut sender: FrameSender, pace: Option<Duration>) {
+    let mut ticks = pace.map(tokio::time::interval);
+    if let Some(ticks) = &mut ticks {
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    }
+    for frame in &clip.frames {
+        if let Some(ticks) = &mut ticks {
+            ticks.tick().await;
+        }
+        // The receiving end says why a stream ended.
+        if sender.send(frame, None).await.is_err() {
+            return;
+        }
+    }
+}
+
+async fn receive(
+    events: &mut StreamEvents,
+    statistics: &mut Statistics,
+    table: &mut JointCsvWriter,
+    rate: f64,
+    bar: &ProgressBar,
+) -> anyhow::Result<End> {
+    let interrupt = tokio::signal::ctrl_c();
+    tokio::pin!(interrupt);
+    loop {
+        let event = tokio::select! {
+            event = events.next() => match event {
+                Ok(Some(event)) => event,
+                Ok(None) => return Ok(End::Complete),
+                Err(error) => return Ok(End::Failed(error)),
+            },
+            _ = &mut interrupt => return Ok(End::Interrupted),
+        };
+        statistics.record(&event);
+        match event {
+            Event::Answer(answer) => {
+                table.write_row(answer.sequence_number as f64 / rate, &answer.joint_angles)?;
+                bar.inc(1);
+            }
+            Event::Dropped(_) => bar.inc(1),
+            Event::ConnectionLost {
+                reason,
+                attempt,
+                retry_in,
+            } => bar.suspend(|| {
+                eprintln!(
+                    "emp: connection lost ({reason}); attempt {attempt} in {} ms",
+                    retry_in.as_millis()
+                );
+            }),
+            Event::Reconnected { resent } => bar.suspend(|| {
+                eprintln!("emp: reconnected; {resent} frames sent again");
+            }),
+        }
+    }
+}
+
+/// A bar on standard error, if that is a terminal.
+fn progress_bar(frames: usize) -> ProgressBar {
+    let bar = ProgressBar::with_draw_target(Some(frames as u64), ProgressDrawTarget::stderr());
+    match ProgressStyle::with_template("{bar:40} {pos}/{len} frames  {per_sec}  {eta} left") {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
+    }
+}
+
+fn print_summary(summary: &Summary, command: &Retarget) {
+    println!(
+        "{} of {} frames written to {}",
+        summary.answered,
+        summary.frames,
+        command.out.display()
+    );
+    println!(
+        "  rate       {:.0} frames/s over {:.2} s",
+        summary.fps, summary.seconds
+    );
+    print_percentiles("latency", &summary.latency_ms);
+    print_percentiles("queue", &summary.queue_ms);
+    print_percentiles("inference", &summary.inference_ms);
+    println!(
+        "  batch      mean {:.2}, largest {}",
+        summary.batch.mean, summary.batch.max
+    );
+    let error = &summary.direction_error_deg;
+    println!(
+        "  direction  mean {:.2}°, p95 {:.2}° off the person's arms",
+        error.mean, error.p95
+    );
+    println!(
+        "  limits     {:.1} % of frames with a joint at a limit",
+        100.0 * summary.limit_share
+    );
+    let dropped: Vec<_> = summary
+        .dropped
+        .iter()
+        .map(|(reason, count)| format!("{count} {reason}"))
+        .collect();
+    println!(
+        "  dropped    {}",
+        if dropped.is_empty() {
+            "none".to_owned()
+        } else {
+            dropped.join(", ")
+        }
+    );
+    if summary.reconnects > 0 {
+        println!("  reconnects {}", summary.reconnects);
+    }
+}
+
+fn print_percentiles(what: &str, values: &Percentiles) {
+    let Percentiles { p50, p90, p99, max } = values;
+    println!("  {what:<10} p50 {p50:.2} ms, p90 {p90:.2} ms, p99 {p99:.2} ms, max {max:.2} ms");
+}

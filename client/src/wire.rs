@@ -1,0 +1,87 @@
+//! Poses as messages, and messages as this crate's values.
+
+use std::time::{Duration, SystemTime};
+
+use emp_motion::{KeyNode, KeyNodeFrame};
+use emp_proto::v1;
+use nalgebra::{Rotation3, UnitQuaternion};
+
+use crate::stream::{Answer, DropCause, Dropped};
+
+pub(crate) fn pose(frame: &KeyNodeFrame) -> v1::HumanPose {
+    let position = |node: KeyNode| {
+        let p = frame.positions[node as usize];
+        Some(v1::Position {
+            x: p.x,
+            y: p.y,
+            z: p.z,
+        })
+    };
+    let [left, right] = &frame.wrist_rotations;
+    v1::HumanPose {
+        waist: position(KeyNode::Waist),
+        torso: position(KeyNode::Torso),
+        left_shoulder: position(KeyNode::LeftShoulder),
+        right_shoulder: position(KeyNode::RightShoulder),
+        left_elbow: position(KeyNode::LeftElbow),
+        right_elbow: position(KeyNode::RightElbow),
+        left_wrist: position(KeyNode::LeftWrist),
+        right_wrist: position(KeyNode::RightWrist),
+        left_wrist_orientation: left.as_ref().map(quaternion),
+        right_wrist_orientation: right.as_ref().map(quaternion),
+    }
+}
+
+fn quaternion(rotation: &Rotation3<f32>) -> v1::Quaternion {
+    let q = UnitQuaternion::from_rotation_matrix(rotation);
+    v1::Quaternion {
+        w: q.w,
+        x: q.i,
+        y: q.j,
+        z: q.k,
+    }
+}
+
+pub(crate) fn header(sequence_number: u64, time_budget: Option<Duration>) -> v1::FrameHeader {
+    v1::FrameHeader {
+        sequence_number,
+        capture_time: Some(SystemTime::now().into()),
+        // A budget that does not fit a message is no limit.
+        time_budget: time_budget.and_then(|budget| budget.try_into().ok()),
+    }
+}
+
+pub(crate) fn answer(
+    sequence_number: u64,
+    result: v1::RetargetResult,
+    timing: Option<v1::Timing>,
+    latency: Duration,
+) -> Answer {
+    let timing = timing.unwrap_or_default();
+    Answer {
+        sequence_number,
+        joint_angles: result.joint_angles,
+        direction_error: result.direction_error,
+        joints_at_limit: result.joints_at_limit,
+        queue_time: duration(timing.queue_time),
+        inference_time: duration(timing.inference_time),
+        batch_size: timing.batch_size,
+        latency,
+    }
+}
+
+pub(crate) fn dropped(message: v1::DroppedFrame) -> Dropped {
+    let reason = message.reason();
+    Dropped {
+        sequence_number: message.header.unwrap_or_default().sequence_number,
+        cause: DropCause::Server(reason),
+        field: message.field,
+        description: message.description,
+    }
+}
+
+fn duration(duration: Option<prost_types::Duration>) -> Duration {
+    duration
+        .and_then(|duration| duration.try_into().ok())
+        .unwrap_or_default()
+}

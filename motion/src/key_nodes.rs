@@ -148,6 +148,13 @@ impl Nodes {
                 ));
             }
         }
+        if let Some(index) = pos.values.iter().position(|v| !v.is_finite()) {
+            let (frame, node) = (index / (3 * count), index / 3 % count);
+            return Err(npz.error(
+                "pos",
+                &format!("frame {frame}: {} is not finite", names[node]),
+            ));
+        }
         Ok(Self {
             names,
             values: pos.values,

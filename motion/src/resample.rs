@@ -38,16 +38,30 @@ pub(crate) fn resample(frames: &[KeyNodeFrame], from: f64, to: f64) -> Vec<KeyNo
         .collect()
 }
 
-/// Catmull–Rom interpolation at `index` (frames, fractional).
+/// Catmull–Rom interpolation at `index` (frames, fractional). Beyond its ends the motion is taken to go on straight, which
+/// is a matter of weights: the missing sample is twice the end's minus its neighbour's.
 fn at(joints: &[Joints], index: f64) -> Joints {
-    let i = (index.floor() as usize).min(joints.len() - 1);
-    let u = index - i as f64;
-    let neighbour = |offset: usize| &joints[(i + offset).saturating_sub(1).min(joints.len() - 1)];
-    blend(
-        &joints[i],
-        &[neighbour(0), neighbour(1), neighbour(2), neighbour(3)],
-        &catmull_rom(u),
-    )
+    let last = joints.len() - 1;
+    let i = (index.floor() as usize).min(last - 1);
+    let mut weights = catmull_rom(index - i as f64);
+    if i == 0 {
+        weights = [
+            0.0,
+            weights[1] + 2.0 * weights[0],
+            weights[2] - weights[0],
+            weights[3],
+        ];
+    }
+    if i + 2 > last {
+        weights = [
+            weights[0],
+            weights[1] - weights[3],
+            weights[2] + 2.0 * weights[3],
+            0.0,
+        ];
+    }
+    let samples = [i.saturating_sub(1), i, i + 1, (i + 2).min(last)].map(|k| &joints[k]);
+    blend(&joints[i], &samples, &weights)
 }
 
 /// Weights of the four samples around a point at `u` in 0..1 between the middle two.

@@ -227,7 +227,7 @@ fn punch(time: &mut Timeline, how: &Performance, rng: &mut ChaCha8Rng) {
         .turned(0.1, 0.0, 0.0);
     let guarding = Pose::rest().with_arms(&Side::BOTH, guard);
     time.move_to(guarding, 1.6 * how.tempo);
-    let peak = rng.random_range(2.4..3.4) * how.tempo.min(1.1);
+    let peak = rng.random_range(2.8..3.8);
     for _ in 0..how.repeats(rng, 4) {
         for side in Side::BOTH {
             let target = ArmPose::at(0.92, 0.08 - inward, rng.random_range(-0.1..0.15))

@@ -9,7 +9,7 @@ pub(super) const FPS: f64 = 50.0;
 /// Peak over mean speed of a minimum-jerk move.
 const PEAK_OVER_MEAN: f64 = 1.875;
 /// No move is shorter, seconds.
-const SHORTEST_MOVE: f64 = 0.24;
+const SHORTEST_MOVE: f64 = 0.2;
 /// Longest rise and fall of a cycle, seconds.
 const RAMP: f64 = 0.5;
 

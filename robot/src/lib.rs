@@ -12,6 +12,7 @@ mod config;
 mod error;
 mod goal_tree;
 mod kinematics;
+mod loader;
 mod model;
 mod robot;
 

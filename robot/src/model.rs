@@ -62,12 +62,25 @@ fn open(files: &Files<'_>, config: &Config) -> Result<MjSpec, RobotError> {
             command: command.clone(),
         });
     }
-    // MuJoCo takes names as they come; here they are text.
-    std::fs::read_to_string(files.model).map_err(|source| RobotError::Read {
+    check_text(files)?;
+    MjSpec::from_xml(files.model).map_err(|error| RobotError::mujoco(files.model, error))
+}
+
+/// Refuses what MuJoCo would let through: bytes that are no text, and NaN, which it takes for "not given".
+fn check_text(files: &Files<'_>) -> Result<(), RobotError> {
+    let text = std::fs::read_to_string(files.model).map_err(|source| RobotError::Read {
         file: files.model.to_path_buf(),
         source,
     })?;
-    MjSpec::from_xml(files.model).map_err(|error| RobotError::mujoco(files.model, error))
+    let is_nan = |word: &str| word.eq_ignore_ascii_case("nan");
+    let in_word = |c: char| c.is_alphanumeric() || c == '_' || c == '-';
+    let line = text
+        .lines()
+        .position(|line| line.split(|c| !in_word(c)).any(is_nan));
+    line.map_or(Ok(()), |line| {
+        let found = format!("NaN in line {} of {}", line + 1, files.model.display());
+        Err(RobotError::value(files.config, "model", "numbers", found))
+    })
 }
 
 /// Name of a foot's contact sphere in the compiled model.

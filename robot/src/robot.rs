@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use mujoco_rs::prelude::*;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 
-use crate::config::{Config, FootConfig, JointConfig, SphereConfig, WristConfig};
-use crate::kinematics::{Attached, Kinematics};
+use crate::config::{Config, FootConfig, SphereConfig};
+use crate::kinematics::Kinematics;
+use crate::loader::{self, Found, Joints};
 use crate::model::{self, Files, Shapes};
 use crate::{RobotError, goal_tree};
 
@@ -117,15 +118,24 @@ impl Foot {
         }
     }
 
-    /// Centre of the sole in the body's frame: the mean of the spheres' lowest points.
+    /// Centre of the sole in the body's frame: in x and y the middle of what the spheres span, in z their lowest
+    /// point.
     pub fn sole_center(&self) -> [f64; 3] {
-        let mean = self
-            .centers
-            .iter()
-            .map(|center| Vector3::from(*center))
-            .sum::<Vector3<f64>>()
-            / self.centers.len() as f64;
-        (mean - Vector3::z() * self.radius).into()
+        let fold = |axis: usize, start: f64, pick: fn(f64, f64) -> f64| {
+            self.centers
+                .iter()
+                .map(|center| center[axis])
+                .fold(start, pick)
+        };
+        let [lower, upper] = [
+            [0, 1, 2].map(|axis| fold(axis, f64::INFINITY, f64::min)),
+            [0, 1, 2].map(|axis| fold(axis, f64::NEG_INFINITY, f64::max)),
+        ];
+        [
+            f64::midpoint(lower[0], upper[0]),
+            f64::midpoint(lower[1], upper[1]),
+            lower[2] - self.radius,
+        ]
     }
 }
 
@@ -162,37 +172,25 @@ impl Robot {
             model: &model_file,
         };
         let model = model::compile(&files, &config, Shapes::Physical)?;
-        let loader = Loader {
-            files,
-            config: &config,
-            model: &model,
-        };
-
-        let base = loader.base()?;
-        let (goal_joints, leg_joints, columns) = loader.joints(base)?;
-        let feet = [
-            Foot::new(&config.contacts.left_foot),
-            Foot::new(&config.contacts.right_foot),
-        ];
-        let attached = loader.attached(base, goal_joints.len(), &columns, &feet)?;
-        loader.check_masses()?;
-        loader.check_imu()?;
-        let dof = goal_joints.len() + leg_joints.len();
-        let kinematics = Kinematics::new(&model, base, &columns, dof, goal_joints.len(), &attached);
-        let goal_tree = goal_tree::build(&model, base, &columns, goal_joints.len());
-        let standing_height = standing_height(&model, &goal_joints, &leg_joints, &feet);
-
+        let feet = config.contacts.feet().map(|(_, foot)| Foot::new(foot));
+        let Found {
+            base,
+            joints,
+            attached,
+        } = loader::find(&files, &config, &model, &feet)?;
+        let Joints { goal, leg, columns } = joints;
+        let dof = goal.len() + leg.len();
         let robot = Self {
-            goal_tree,
+            goal_tree: goal_tree::build(&model, base, &columns, goal.len()),
             key_nodes: key_nodes(&config),
             link_spheres: link_spheres(&config),
             link_pairs: link_pairs(&config),
+            base_body: loader::body_name(&model, base),
+            standing_height: standing_height(&model, &goal, &leg, &feet),
+            kinematics: Kinematics::new(&model, base, &columns, dof, goal.len(), &attached),
             feet,
-            base_body: body_name(&model, base),
-            standing_height,
-            kinematics,
-            goal_joints,
-            leg_joints,
+            goal_joints: goal,
+            leg_joints: leg,
             model,
             config_file,
             model_file,
@@ -413,261 +411,4 @@ fn standing_height(model: &MjModel, goal: &[Joint], leg: &[Joint], feet: &[Foot;
         })
         .map(|(geom, radius)| radius - data.geom_xpos()[geom][2])
         .fold(f64::NEG_INFINITY, f64::max)
-}
-
-fn body_name(model: &MjModel, body: usize) -> String {
-    model
-        .id_to_name(MjtObjBase::mjOBJ_BODY, body)
-        .unwrap_or_default()
-        .to_owned()
-}
-
-/// Checks the configuration against the compiled model.
-struct Loader<'a> {
-    files: Files<'a>,
-    config: &'a Config,
-    model: &'a MjModel,
-}
-
-impl Loader<'_> {
-    fn error(
-        &self,
-        key: impl Into<String>,
-        expected: impl Into<String>,
-        found: impl Into<String>,
-    ) -> RobotError {
-        RobotError::value(self.files.config, key, expected, found)
-    }
-
-    fn body(&self, key: String, name: &str) -> Result<usize, RobotError> {
-        let missing = || {
-            let expected = format!("a body of {}", self.files.model.display());
-            self.error(key, expected, format!("{name:?}"))
-        };
-        self.model
-            .name_to_id(MjtObjBase::mjOBJ_BODY, name)
-            .ok_or_else(missing)
-    }
-
-    /// The body that floats: the only one with a free joint, standing directly in the world.
-    fn base(&self) -> Result<usize, RobotError> {
-        let free: Vec<usize> = (0..self.model.jnt_type().len())
-            .filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_FREE)
-            .collect();
-        // MuJoCo allows free joints in top-level bodies only; `qpos` starts with the base's.
-        match free[..] {
-            [0] => Ok(self.model.jnt_bodyid()[0] as usize),
-            _ => Err(self.error(
-                "model",
-                "a model with one free joint, that of the base, before all others",
-                format!("{} free joints", free.len()),
-            )),
-        }
-    }
-
-    /// Goal joints, leg joints, and the column in a joint vector of each joint id.
-    fn joints(&self, base: usize) -> Result<(Vec<Joint>, Vec<Joint>, Vec<usize>), RobotError> {
-        let joints = self.model.jnt_type().len();
-        let mut columns = vec![usize::MAX; joints];
-        let mut all = Vec::new();
-        for (column, (key, config)) in self.config.joints.keyed().enumerate() {
-            let (id, joint) = self.joint(&key, config, base)?;
-            columns[id] = column;
-            all.push(joint);
-        }
-        for (id, column) in columns.iter().enumerate().skip(1) {
-            if *column == usize::MAX {
-                let name = self
-                    .model
-                    .id_to_name(MjtObjBase::mjOBJ_JOINT, id)
-                    .unwrap_or("a joint without a name");
-                let expected =
-                    "every joint of the model in joints.goal, joints.leg or joints.locked";
-                return Err(self.error("joints", expected, format!("{name:?} in none of them")));
-            }
-        }
-        let leg = all.split_off(self.config.joints.goal.len());
-        Ok((all, leg, columns))
-    }
-
-    fn joint(
-        &self,
-        key: &str,
-        config: &JointConfig,
-        base: usize,
-    ) -> Result<(usize, Joint), RobotError> {
-        let model = self.model;
-        let name_key = format!("{key}.name");
-        let expect = |expected: &str, found: String| self.error(&name_key, expected, found);
-        let id = model
-            .name_to_id(MjtObjBase::mjOBJ_JOINT, &config.name)
-            .ok_or_else(|| expect("a joint of the model", format!("{:?}", config.name)))?;
-        if model.jnt_type()[id] != MjtJoint::mjJNT_HINGE {
-            return Err(expect(
-                "a hinge",
-                format!("{:?} of another type", config.name),
-            ));
-        }
-        if model.body_rootid()[model.jnt_bodyid()[id] as usize] as usize != base {
-            return Err(expect(
-                "a joint below the base",
-                format!("{:?} elsewhere", config.name),
-            ));
-        }
-        let qpos_address = model.jnt_qposadr()[id] as usize;
-        if model.qpos0()[qpos_address] != 0.0 {
-            let found = format!("ref {} of {:?}", model.qpos0()[qpos_address], config.name);
-            return Err(expect("a joint with reference angle 0", found));
-        }
-        let range = model.jnt_range()[id];
-        let limited = model.jnt_limited()[id] && range.iter().all(|limit| limit.is_finite());
-        if !limited || range[0] >= range[1] {
-            let found = if limited {
-                format!("{range:?} of {:?}", config.name)
-            } else {
-                "none".to_owned()
-            };
-            return Err(expect(
-                "a joint with a range from its lower to its upper limit",
-                found,
-            ));
-        }
-        if !(range[0]..=range[1]).contains(&config.default) {
-            let expected = format!("an angle within the joint's range {range:?}");
-            return Err(self.error(
-                format!("{key}.default"),
-                expected,
-                config.default.to_string(),
-            ));
-        }
-        Ok((
-            id,
-            Joint {
-                name: config.name.clone(),
-                range,
-                kp: config.kp,
-                kd: config.kd,
-                torque_limit: config.torque_limit,
-                velocity_limit: config.velocity_limit,
-                armature: config.armature,
-                damping: config.damping,
-                default: config.default,
-                qpos_address,
-                dof_address: model.jnt_dofadr()[id] as usize,
-            },
-        ))
-    }
-
-    /// What is attached to bodies: key nodes, wrist frames, link spheres, soles.
-    fn attached(
-        &self,
-        base: usize,
-        goal_joints: usize,
-        columns: &[usize],
-        feet: &[Foot; 2],
-    ) -> Result<Attached, RobotError> {
-        let mut key_nodes = Vec::new();
-        for (name, (body, offset)) in KEY_NODE_NAMES
-            .into_iter()
-            .zip(self.config.key_nodes.points())
-        {
-            let key = format!("key_nodes.{name}.body");
-            let id = self.robot_body(key.clone(), body, base)?;
-            let is_goal = |joint: usize| columns[joint] < goal_joints;
-            if !self.carriers(id, base).all(is_goal) {
-                return Err(self.error(key, "a body that no leg joint moves", format!("{body:?}")));
-            }
-            key_nodes.push((id, Vector3::from(offset)));
-        }
-        if key_nodes[0].0 != base {
-            let expected = format!("the base, {:?}", body_name(self.model, base));
-            return Err(self.error(
-                "key_nodes.waist.body",
-                expected,
-                format!("{:?}", self.config.key_nodes.waist.body),
-            ));
-        }
-        let [left, right] = self.config.key_nodes.wrists().map(wrist_axes);
-        let [left_body, right_body] = [key_nodes[KEY_NODES - 2].0, key_nodes[KEY_NODES - 1].0];
-        Ok(Attached {
-            key_nodes,
-            links: self.links(base)?,
-            wrists: [(left_body, left), (right_body, right)],
-            soles: [
-                self.sole("contacts.left_foot", &feet[0], base)?,
-                self.sole("contacts.right_foot", &feet[1], base)?,
-            ],
-        })
-    }
-
-    fn links(&self, base: usize) -> Result<Vec<(usize, Vector3<f64>)>, RobotError> {
-        let spheres = self.config.links.spheres.iter().enumerate();
-        spheres
-            .map(|(i, sphere)| {
-                let body =
-                    self.robot_body(format!("links.spheres[{i}].body"), &sphere.body, base)?;
-                Ok((body, Vector3::from(sphere.center)))
-            })
-            .collect()
-    }
-
-    fn sole(
-        &self,
-        key: &str,
-        foot: &Foot,
-        base: usize,
-    ) -> Result<(usize, Vector3<f64>), RobotError> {
-        let body = self.robot_body(format!("{key}.body"), &foot.body, base)?;
-        Ok((body, Vector3::from(foot.sole_center())))
-    }
-
-    /// A body of the robot: the base or one below it.
-    fn robot_body(&self, key: String, name: &str, base: usize) -> Result<usize, RobotError> {
-        let body = self.body(key.clone(), name)?;
-        if self.model.body_rootid()[body] as usize != base {
-            return Err(self.error(key, "a body of the robot", format!("{name:?}")));
-        }
-        Ok(body)
-    }
-
-    /// The joints that carry `body`, the base's excluded.
-    fn carriers(&self, body: usize, base: usize) -> impl Iterator<Item = usize> {
-        let parent = |&body: &usize| Some(self.model.body_parentid()[body] as usize);
-        std::iter::successors(Some(body), parent)
-            .take_while(move |&body| body != base)
-            .flat_map(|body| {
-                let first = self.model.body_jntadr()[body].max(0) as usize;
-                first..first + self.model.body_jntnum()[body] as usize
-            })
-    }
-
-    fn check_masses(&self) -> Result<(), RobotError> {
-        for (body, &mass) in self.model.body_mass().iter().enumerate() {
-            if !(mass.is_finite() && mass >= 0.0) {
-                let found = format!("{mass} of body {:?}", body_name(self.model, body));
-                return Err(self.error("model", "bodies with finite masses", found));
-            }
-        }
-        Ok(())
-    }
-
-    fn check_imu(&self) -> Result<(), RobotError> {
-        let name = &self.config.imu_site;
-        match self.model.name_to_id(MjtObjBase::mjOBJ_SITE, name) {
-            Some(_) => Ok(()),
-            None => {
-                let expected = format!("a site of {}", self.files.model.display());
-                Err(self.error("imu_site", expected, format!("{name:?}")))
-            }
-        }
-    }
-}
-
-/// The wrist convention in the wrist body's frame: x to the fingers, z to the thumb, y = z × x, as columns.
-///
-/// The configuration's vectors are unit and at right angles to within rounding; the result is an exact rotation.
-fn wrist_axes(wrist: &WristConfig) -> Matrix3<f64> {
-    let x = Vector3::from(wrist.fingers).normalize();
-    let y = Vector3::from(wrist.thumb).cross(&x).normalize();
-    Matrix3::from_columns(&[x, y, x.cross(&y)])
 }

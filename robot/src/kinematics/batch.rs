@@ -96,16 +96,17 @@ fn mix<T: Real>(a: Vec3<T>, b: Vec3<T>, sine: Lane<T>, cosine: Lane<T>) -> (Vec3
     ([a0, a1, a2], [b0, b1, b2])
 }
 
-/// Reads column `column` of up to [`LANES`] rows of `width`; the last row stands in for those beyond the end.
+/// Reads column `column` of up to [`LANES`] rows of `width`; missing rows are zero.
 #[inline(always)]
 fn gather<T: Real>(rows: &[T], width: usize, column: usize) -> Lane<T> {
-    let last = rows.len() - width;
-    Lane(std::array::from_fn(|i| {
-        rows[(i * width).min(last) + column]
-    }))
+    let mut lane = Lane::ZERO;
+    for (slot, value) in lane.0.iter_mut().zip(rows[column..].iter().step_by(width)) {
+        *slot = *value;
+    }
+    lane
 }
 
-/// Writes (columns `column`, …) of up to [`LANES`] rows of `width`.
+/// Writes columns `column`, … of up to [`LANES`] rows of `width`.
 #[inline(always)]
 fn scatter<T: Real, const N: usize>(
     rows: &mut [T],

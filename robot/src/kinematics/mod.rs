@@ -33,7 +33,7 @@ pub struct OutputLayout {
     pub link_centers: Range<usize>,
     /// Centre of mass of the whole robot: 3.
     pub center_of_mass: Range<usize>,
-    /// Centre of the support surface: the mean of the two soles' centres: 3.
+    /// Centre of the support surface: midway between the centres of the two soles: 3.
     pub foot_support: Range<usize>,
 }
 
@@ -123,7 +123,7 @@ impl Kinematics {
     }
 
     /// Vector–Jacobian product: the gradient `grad_q` [B × dof] of a scalar with respect to `q` [B × dof], from its
-    /// gradient `grad_out` [B × output_width] with respect to the outputs at `q`. Overwrites `grad_q`.
+    /// gradient `grad_out` [B × `output_width`] with respect to the outputs at `q`. Overwrites `grad_q`.
     ///
     /// # Panics
     /// If the lengths are not those of the same number of rows.

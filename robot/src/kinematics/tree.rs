@@ -167,9 +167,10 @@ impl<'a> Builder<'a> {
                     * UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
                 node: parent.node,
             };
-            let first = model.body_jntadr()[id].max(0) as usize;
-            for joint in first..first + model.body_jntnum()[id] as usize {
-                self.joint(id, joint, columns[joint]);
+            for (joint, &column) in columns.iter().enumerate() {
+                if model.jnt_bodyid()[joint] as usize == id {
+                    self.joint(id, joint, column);
+                }
             }
         }
         let Body { node, .. } = self.bodies[id];

@@ -7,20 +7,20 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// The project's folder of robots.
-pub fn robots() -> PathBuf {
+pub(crate) fn robots() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../robots")
 }
 
 /// emp27, and g1 where it was fetched; prints that it is skipped where not.
-pub fn all() -> Vec<Robot> {
-    let mut robots =
-        vec![Robot::load(&self::robots().join("emp27")).expect("emp27 ships with the project")];
-    robots.extend(g1());
-    robots
+pub(crate) fn all() -> Vec<Robot> {
+    let mut loaded =
+        vec![Robot::load(&robots().join("emp27")).expect("emp27 ships with the project")];
+    loaded.extend(g1());
+    loaded
 }
 
 /// g1, or none with a printed reason.
-pub fn g1() -> Option<Robot> {
+fn g1() -> Option<Robot> {
     match Robot::load(&robots().join("g1")) {
         Ok(robot) => Some(robot),
         Err(error @ RobotError::NotFetched { .. }) => {
@@ -32,14 +32,15 @@ pub fn g1() -> Option<Robot> {
 }
 
 /// A generator with a fixed seed.
-pub fn seeded(seed: u64) -> ChaCha8Rng {
+pub(crate) fn seeded(seed: u64) -> ChaCha8Rng {
     ChaCha8Rng::seed_from_u64(seed)
 }
 
 /// `rows` joint vectors within the robot's limits, row-major.
-pub fn random_poses(robot: &Robot, rng: &mut impl Rng, rows: usize) -> Vec<f64> {
+pub(crate) fn random_poses(robot: &Robot, rng: &mut impl Rng, rows: usize) -> Vec<f64> {
     (0..rows)
-        .flat_map(|_| robot.joints().map(|joint| joint.range).collect::<Vec<_>>())
+        .flat_map(|_| robot.joints())
+        .map(|joint| joint.range)
         .map(|[lower, upper]| rng.random_range(lower..=upper))
         .collect()
 }

@@ -11,7 +11,13 @@ use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|data: &[u8]| {
     check(data);
-    check(&archive::stored(&[("mocap_framerate", &archive::npy("'<f8'", "()", &100_f64.to_le_bytes())), ("poses", data)]));
+    check(&archive::stored(&[
+        (
+            "mocap_framerate",
+            &archive::npy("'<f8'", "()", &100_f64.to_le_bytes()),
+        ),
+        ("poses", data),
+    ]));
 });
 
 fn check(archive: &[u8]) {

@@ -2,17 +2,25 @@
 
 use std::path::Path;
 
-use tempfile::NamedTempFile;
+use tempfile::{Builder, NamedTempFile};
 
 use crate::MotionError;
 
-/// A temporary file in the folder of `path`, gone when dropped.
+/// A temporary file in the folder of `path`, gone when dropped; readable as any new file is, not only by its owner.
 pub(crate) fn temporary(path: &Path) -> Result<NamedTempFile, MotionError> {
     let folder = path
         .parent()
         .filter(|p| !p.as_os_str().is_empty())
         .unwrap_or(Path::new("."));
-    NamedTempFile::new_in(folder).map_err(|e| MotionError::io(path, e))
+    let mut builder = Builder::new();
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        builder.permissions(std::fs::Permissions::from_mode(0o666));
+    }
+    builder
+        .tempfile_in(folder)
+        .map_err(|e| MotionError::io(path, e))
 }
 
 /// Gives a complete temporary file its name.

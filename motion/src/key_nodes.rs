@@ -1,7 +1,7 @@
 //! Key-node `.npz` files: our own, and those computed from optical markers on a seated person's trunk and arms.
 //!
 //! Both have `fps`, `nodes` (names), `pos[T, N, 3]` (metres, x forward, y left, z up) and `wrist_R[T, 2, 3, 3]` (left,
-//! right; NaN where unknown). A file that has a `waist` is taken as it is: this is what [`write`] leaves. A marker file
+//! right; NaN where unknown). A file that has a `waist` is taken as it is: this is what [`write()`] leaves. A marker file
 //! has `sternum` and `clav_mid` instead; its trunk is rebuilt at the body's own scale.
 
 use std::path::Path;

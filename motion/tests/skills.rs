@@ -20,7 +20,7 @@ fn peak(clip: &Clip, order: i32) -> f32 {
         for _ in 0..order {
             track = track.windows(2).map(|w| w[1] - w[0]).collect();
         }
-        track.iter().map(|d| d.norm()).fold(0.0, f32::max) * (clip.fps as f32).powi(order)
+        track.iter().map(Vector3::norm).fold(0.0, f32::max) * (clip.fps as f32).powi(order)
     };
     peak_of(KeyNode::LeftWrist).max(peak_of(KeyNode::RightWrist))
 }

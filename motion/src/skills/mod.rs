@@ -247,3 +247,54 @@ fn finish(name: String, body: &Body, time: &Timeline, rng: &mut ChaCha8Rng) -> C
         frames: time.poses.iter().enumerate().map(frame).collect(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_medley_shows_every_skill_long_enough_to_see_it() {
+        for seed in 0..20 {
+            let (clip, starts) = medley_with_starts(seed);
+            let ends = starts[1..].iter().copied().chain([clip.frames.len()]);
+            for ((skill, start), end) in Skill::ALL.iter().zip(&starts).zip(ends) {
+                let shown = &clip.frames[*start..end];
+                assert!(
+                    shown.len() > 25,
+                    "seed {seed}: {} lasts {} frames",
+                    skill.name(),
+                    shown.len()
+                );
+                let moved = |f: &KeyNodeFrame| {
+                    (0..8)
+                        .map(|n| (f.positions[n] - shown[0].positions[n]).norm())
+                        .fold(0.0, f32::max)
+                };
+                assert!(
+                    shown.iter().map(moved).fold(0.0, f32::max) > 0.05,
+                    "seed {seed}: {} stands still",
+                    skill.name()
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn no_performance_needs_the_last_try() {
+        for seed in 0..40 {
+            for skill in Skill::ALL {
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                let body = Body::random(&mut rng);
+                let mut time = Timeline::new(&body);
+                append(&mut time, &body, skill, seed % 2 == 0, &mut rng);
+                assert!(
+                    time.poses
+                        .iter()
+                        .all(|pose| body.is_clear(&body.frame(pose))),
+                    "{} {seed}",
+                    skill.name()
+                );
+            }
+        }
+    }
+}

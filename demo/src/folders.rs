@@ -1,0 +1,39 @@
+//! Where robots, weights and the server are.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+
+/// The project's folders, and the server's binary.
+pub(crate) struct Folders {
+    /// One folder a robot.
+    pub(crate) robots: PathBuf,
+    /// One file a model.
+    pub(crate) weights: PathBuf,
+    /// `emp-server`, beside this binary.
+    pub(crate) server: PathBuf,
+}
+
+impl Folders {
+    /// Takes the nearest folder upward from this binary, then from the working directory, that has `robots` and
+    /// `models/weights`: the rule of `emp-server`.
+    pub(crate) fn find() -> Result<Self> {
+        let exe = std::env::current_exe().context("cannot tell where emp-demo itself stands")?;
+        let here = std::env::current_dir().context("there is no working directory")?;
+        let root = exe
+            .ancestors()
+            .chain(here.ancestors())
+            .find(|folder| has_models(folder))
+            .context("found no folder with robots/ and models/weights/, neither above emp-demo nor above the working directory")?;
+        let server = exe.with_file_name(format!("emp-server{}", std::env::consts::EXE_SUFFIX));
+        Ok(Self {
+            robots: root.join("robots"),
+            weights: root.join("models/weights"),
+            server,
+        })
+    }
+}
+
+fn has_models(folder: &Path) -> bool {
+    folder.join("robots").is_dir() && folder.join("models/weights").is_dir()
+}

@@ -1,0 +1,51 @@
+//! Which moments of a motion are worth a picture.
+
+use emp_motion::{KeyNode, KeyNodeFrame};
+
+/// Frames that differ most from one another, in order of time: each next one is the frame farthest from all chosen ones.
+///
+/// At most `count`, fewer where the motion is shorter. No two lie closer together than a third of their mean distance,
+/// so that the whole motion is covered.
+pub(crate) fn differing(frames: &[KeyNodeFrame], count: usize) -> Vec<usize> {
+    let gap = frames.len() / (3 * count.max(1));
+    let mut novelty: Vec<f32> = frames
+        .iter()
+        .map(|frame| distance(frame, &frames[0]))
+        .collect();
+    let mut chosen = Vec::new();
+    while chosen.len() < count.min(frames.len()) {
+        let far = |index: usize| {
+            chosen
+                .iter()
+                .all(|&other: &usize| index != other && index.abs_diff(other) >= gap)
+        };
+        let next = (0..frames.len())
+            .filter(|&index| far(index))
+            .max_by(|&a, &b| novelty[a].total_cmp(&novelty[b]));
+        let Some(next) = next else { break };
+        for (novelty, frame) in novelty.iter_mut().zip(frames) {
+            let distance = distance(frame, &frames[next]);
+            *novelty = if chosen.is_empty() {
+                distance
+            } else {
+                novelty.min(distance)
+            };
+        }
+        chosen.push(next);
+    }
+    chosen.sort_unstable();
+    chosen
+}
+
+/// Distance of two poses: how far elbows and wrists are apart, metres.
+fn distance(a: &KeyNodeFrame, b: &KeyNodeFrame) -> f32 {
+    [
+        KeyNode::LeftElbow,
+        KeyNode::RightElbow,
+        KeyNode::LeftWrist,
+        KeyNode::RightWrist,
+    ]
+    .map(|node| (a.position(node) - b.position(node)).norm())
+    .iter()
+    .sum()
+}

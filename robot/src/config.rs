@@ -119,9 +119,11 @@ pub(crate) struct PointConfig {
 pub(crate) struct WristConfig {
     pub(crate) body: String,
     pub(crate) offset: [f64; 3],
-    /// Unit vector from the wrist to the fingers, in the body's frame.
+    /// The body that turns with the hand: `body` itself or one below it.
+    pub(crate) hand: String,
+    /// Unit vector from the wrist to the fingers, in the hand's frame.
     pub(crate) fingers: [f64; 3],
-    /// Unit vector toward the thumb, at a right angle to `fingers`, in the body's frame.
+    /// Unit vector toward the thumb, at a right angle to `fingers`, in the hand's frame.
     pub(crate) thumb: [f64; 3],
 }
 
@@ -326,6 +328,7 @@ impl Checks<'_> {
             self.finite(&format!("key_nodes.{name}.offset"), offset)?;
         }
         for (name, wrist) in ["left_wrist", "right_wrist"].iter().zip(nodes.wrists()) {
+            self.name(&format!("key_nodes.{name}.hand"), &wrist.hand)?;
             let [fingers, thumb] = [
                 format!("key_nodes.{name}.fingers"),
                 format!("key_nodes.{name}.thumb"),

@@ -220,17 +220,45 @@ impl Loader<'_> {
                 format!("{:?}", self.config.key_nodes.waist.body),
             ));
         }
-        let [left, right] = self.config.key_nodes.wrists().map(wrist_axes);
-        let [left_body, right_body] = [key_nodes[KEY_NODES - 2].0, key_nodes[KEY_NODES - 1].0];
+        let [left, right] = self.config.key_nodes.wrists();
+        let wrists = [
+            (
+                self.hand("left_wrist", left, key_nodes[KEY_NODES - 2].0, base)?,
+                wrist_axes(left),
+            ),
+            (
+                self.hand("right_wrist", right, key_nodes[KEY_NODES - 1].0, base)?,
+                wrist_axes(right),
+            ),
+        ];
         Ok(Attached {
             key_nodes,
             links: self.links(base)?,
-            wrists: [(left_body, left), (right_body, right)],
+            wrists,
             soles: [
                 self.sole("contacts.left_foot", &feet[0], base)?,
                 self.sole("contacts.right_foot", &feet[1], base)?,
             ],
         })
+    }
+
+    /// The hand of a wrist: the node's body or one that it carries.
+    fn hand(
+        &self,
+        name: &str,
+        wrist: &WristConfig,
+        body: usize,
+        base: usize,
+    ) -> Result<usize, RobotError> {
+        let key = format!("key_nodes.{name}.hand");
+        let hand = self.robot_body(key.clone(), &wrist.hand, base)?;
+        let parent =
+            |&body: &usize| (body != base).then(|| self.model.body_parentid()[body] as usize);
+        if !std::iter::successors(Some(hand), parent).any(|ancestor| ancestor == body) {
+            let expected = format!("{:?} or a body that it carries", wrist.body);
+            return Err(self.error(key, expected, format!("{:?}", wrist.hand)));
+        }
+        Ok(hand)
     }
 
     fn links(&self, base: usize) -> Result<Vec<(usize, Vector3<f64>)>, RobotError> {
@@ -296,7 +324,7 @@ impl Loader<'_> {
     }
 }
 
-/// The wrist convention in the wrist body's frame: x to the fingers, z to the thumb, y = z × x, as columns.
+/// The wrist convention in the hand's frame: x to the fingers, z to the thumb, y = z × x, as columns.
 ///
 /// The configuration's vectors are unit and at right angles to within rounding; the result is an exact rotation.
 fn wrist_axes(wrist: &WristConfig) -> Matrix3<f64> {

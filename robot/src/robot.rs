@@ -250,6 +250,14 @@ impl Robot {
         &self.key_nodes
     }
 
+    /// Names of the bodies that turn with the hands, left and right; the wrist rotations are theirs.
+    pub fn hand_bodies(&self) -> [&str; 2] {
+        self.config
+            .key_nodes
+            .wrists()
+            .map(|wrist| wrist.hand.as_str())
+    }
+
     /// The links as spheres.
     pub fn link_spheres(&self) -> &[LinkSphere] {
         &self.link_spheres

@@ -285,6 +285,21 @@ const CASES: &[Case] = &[
             "\"left_shoe\"",
         ],
     ),
+    toml(
+        "hand = \"left_hand\"",
+        "hand = \"left_glove\"",
+        &[
+            "robot.toml: key_nodes.left_wrist.hand: expected a body of",
+            "\"left_glove\"",
+        ],
+    ),
+    toml(
+        "hand = \"left_hand\"",
+        "hand = \"right_hand\"",
+        &[
+            "robot.toml: key_nodes.left_wrist.hand: expected \"left_hand\" or a body that it carries, found \"right_hand\"",
+        ],
+    ),
     // Values that must agree with the model.
     toml(
         "default = 0.5 ",

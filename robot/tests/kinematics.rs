@@ -62,7 +62,7 @@ impl Reference {
             row.extend_from_slice(point(&node.body, node.offset).as_slice());
         }
         for (side, zero) in wrist_axes(robot).iter().enumerate() {
-            let body = self.body(&data, &robot.key_nodes()[6 + side].body);
+            let body = self.body(&data, robot.hand_bodies()[side]);
             let rotation = body.rotation.to_rotation_matrix() * zero;
             row.extend_from_slice(rotation.transpose().as_slice());
         }
@@ -313,12 +313,9 @@ fn frame_derivatives_equal_central_differences() {
             frame.update(&q);
             for node in 0..KEY_NODES {
                 let expected = (ahead[node] - behind[node]) / (2.0 * STEP);
+                let found = frame.position_derivative(node, joint);
                 let moves = frame.joints_moving(node).contains(&joint);
-                let found = if moves {
-                    frame.position_derivative(node, joint)
-                } else {
-                    Vector3::zeros()
-                };
+                assert!(moves || found.norm() == 0.0);
                 assert!(
                     (found - expected).norm() < 1e-8,
                     "{} {} {joint}",
@@ -342,6 +339,31 @@ fn frame_derivatives_equal_central_differences() {
                         robot.name()
                     );
                 }
+            }
+        }
+    }
+}
+
+/// The forearm's direction is the elbow's doing alone: no wrist joint moves the wrist's node.
+#[test]
+fn bending_a_wrist_does_not_turn_the_forearm() {
+    for robot in common::all() {
+        let mut frame = robot.kinematics().frame();
+        let q = common::random_poses(&robot, &mut common::seeded(10), 1);
+        frame.update(&q[..robot.goal_joints().len()]);
+        for (joint, name) in robot
+            .goal_joints()
+            .iter()
+            .map(|joint| &joint.name)
+            .enumerate()
+        {
+            for node in (KEY_NODES - 2..KEY_NODES).filter(|_| name.contains("wrist")) {
+                let derivative = frame.position_derivative(node, joint);
+                assert!(
+                    derivative.norm() < 1e-12,
+                    "{name} moves {}",
+                    KEY_NODE_NAMES[node]
+                );
             }
         }
     }

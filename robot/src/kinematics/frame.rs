@@ -14,7 +14,8 @@ use crate::robot::KEY_NODES;
 /// - ∂p/∂qⱼ = aⱼ × (p − oⱼ) for the position p of a key node that j moves ([`position_derivative`]),
 /// - ∂r/∂qⱼ = aⱼ × r for a column r of a wrist's rotation that j moves ([`direction_derivative`]),
 ///
-/// and both are zero for joints that are not in [`joints_moving`](Self::joints_moving) of that node. For the
+/// and both are zero for joints that are not in [`joints_moving`](Self::joints_moving) of that node. A joint of the
+/// hand beyond the wrist's node turns the wrist without moving the node: there the first is zero, the second not. For the
 /// direction d of a bone between two key nodes p₁ → p₂ of length l: ∂d/∂qⱼ = (I − d dᵀ)(∂p₂/∂qⱼ − ∂p₁/∂qⱼ) / l.
 ///
 /// Everything is in the base's frame, metres and radians. Legs do not move key nodes.
@@ -32,7 +33,10 @@ pub struct FrameKinematics {
     anchors: Vec<Vector3<f64>>,
     positions: [Vector3<f64>; KEY_NODES],
     wrists: [Matrix3<f64>; 2],
+    /// Joints that move a key node or turn its wrist.
     chains: [Vec<usize>; KEY_NODES],
+    /// Which joints move a key node's position.
+    moves: [Vec<bool>; KEY_NODES],
 }
 
 impl FrameKinematics {
@@ -42,7 +46,16 @@ impl FrameKinematics {
         let moved = (1..tree.nodes.len())
             .filter(|&node| tree.nodes[node].joint < joints)
             .collect();
-        let chains = std::array::from_fn(|key_node| chain(&tree, tree.points[key_node].node));
+        let chains = std::array::from_fn(|key_node| {
+            let wrist = key_node
+                .checked_sub(KEY_NODES - 2)
+                .map(|side| tree.wrists[side].node);
+            chain(&tree, wrist.unwrap_or(tree.points[key_node].node))
+        });
+        let moves = std::array::from_fn(|key_node| {
+            let chain = chain(&tree, tree.points[key_node].node);
+            (0..joints).map(|joint| chain.contains(&joint)).collect()
+        });
         let nodes = tree.nodes.len();
         let mut frame = Self {
             tree,
@@ -54,6 +67,7 @@ impl FrameKinematics {
             positions: [Vector3::zeros(); KEY_NODES],
             wrists: [Matrix3::identity(); 2],
             chains,
+            moves,
         };
         frame.update(&vec![0.0; joints]);
         frame
@@ -103,14 +117,17 @@ impl FrameKinematics {
         &self.anchors
     }
 
-    /// The goal joints between the base and a key node, base first. All other joints leave it where it is.
-    /// A wrist's rotation is moved by the joints of its key node.
+    /// The goal joints between the base and a key node, base first; of a wrist, those between the base and the hand.
+    /// All other joints leave the node where it is, and the wrist's rotation as it is.
     pub fn joints_moving(&self, key_node: usize) -> &[usize] {
         &self.chains[key_node]
     }
 
-    /// ∂(position of `key_node`)/∂q of a goal joint in [`joints_moving`](Self::joints_moving) of it.
+    /// ∂(position of `key_node`)/∂q of a goal joint; zero where the joint does not move it.
     pub fn position_derivative(&self, key_node: usize, joint: usize) -> Vector3<f64> {
+        if !self.moves[key_node][joint] {
+            return Vector3::zeros();
+        }
         self.axes[joint].cross(&(self.positions[key_node] - self.anchors[joint]))
     }
 

@@ -1,1 +1,165 @@
-//! Placeholder until the crate's first commit.
+//! What the end-to-end tests share: servers to start and kill, models under a test's control, poses, binaries.
+//!
+//! The tests themselves are in `tests/`. A server runs on a runtime of its own, so that killing it closes its
+//! connections as a crash would. This crate is for tests and benchmarks only; no other crate may depend on it.
+
+#![forbid(unsafe_code)]
+
+pub mod fake;
+pub mod process;
+pub mod raw;
+
+use std::{
+    future::Future,
+    net::SocketAddr,
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::Duration,
+};
+
+use anyhow::Context as _;
+use emp_motion::{KeyNodeFrame, skills};
+use emp_robot::Robot;
+use emp_server::{Catalog, Drain, ServeError, Server, Settings};
+use tokio::{runtime::Runtime, task::JoinHandle};
+use tokio_util::sync::CancellationToken;
+
+/// No step of a test takes this long on a slow machine; one that does hangs.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A server inside the test's process.
+pub struct TestServer {
+    address: SocketAddr,
+    shutdown: CancellationToken,
+    running: Option<JoinHandle<Result<Drain, ServeError>>>,
+    runtime: Option<Runtime>,
+}
+
+impl TestServer {
+    /// Starts a server on a free loopback port.
+    ///
+    /// # Errors
+    /// When it cannot listen.
+    pub fn start(settings: Settings, catalog: Catalog) -> anyhow::Result<Self> {
+        Self::start_on(0, settings, catalog)
+    }
+
+    /// Starts a server on a port.
+    ///
+    /// # Errors
+    /// When it cannot listen.
+    pub fn start_on(port: u16, mut settings: Settings, catalog: Catalog) -> anyhow::Result<Self> {
+        settings.listen = SocketAddr::from(([127, 0, 0, 1], port));
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()?;
+        let shutdown = CancellationToken::new();
+        let (bound_sender, bound) = std::sync::mpsc::sync_channel(1);
+        let stop = shutdown.clone();
+        let running = runtime.spawn(async move {
+            match Server::bind(settings, catalog).await {
+                Ok(server) => {
+                    let _ = bound_sender.send(Ok(server.address()));
+                    server.run(stop).await
+                }
+                Err(error) => {
+                    let _ = bound_sender.send(Err(error.to_string()));
+                    Ok(Drain::Complete)
+                }
+            }
+        });
+        let address = bound.recv()?.map_err(anyhow::Error::msg)?;
+        Ok(Self {
+            address,
+            shutdown,
+            running: Some(running),
+            runtime: Some(runtime),
+        })
+    }
+
+    /// Starts a server with the shipped robots and weights.
+    ///
+    /// # Errors
+    /// When nothing can be served.
+    pub fn start_real(mut settings: Settings) -> anyhow::Result<Self> {
+        settings.robots = Some(root().join("robots"));
+        settings.weights = Some(root().join("models/weights"));
+        let catalog = Catalog::load(&settings)?;
+        Self::start(settings, catalog)
+    }
+
+    /// The server's URL.
+    pub fn url(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    /// The server's port.
+    pub fn port(&self) -> u16 {
+        self.address.port()
+    }
+
+    /// Tells the server to drain, as SIGTERM does.
+    pub fn begin_shutdown(&self) {
+        self.shutdown.cancel();
+    }
+
+    /// Waits until a server that was told to drain has ended.
+    ///
+    /// # Errors
+    /// When it failed.
+    pub async fn ended(mut self) -> anyhow::Result<Drain> {
+        let running = self.running.take().context("a server that runs")?;
+        Ok(within("the server's end", running).await???)
+    }
+
+    /// Ends the server as a crash would: connections break in the middle of what they do.
+    pub fn kill(self) {
+        drop(self);
+    }
+}
+
+impl Drop for TestServer {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            // A runtime must not be dropped, and so waited for, inside another.
+            runtime.shutdown_background();
+        }
+    }
+}
+
+/// The checkout's root.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .map_or_else(PathBuf::new, Path::to_owned)
+}
+
+/// The robot that ships with the project.
+///
+/// # Errors
+/// When its files are broken.
+pub fn emp27() -> anyhow::Result<Arc<Robot>> {
+    Ok(Arc::new(Robot::load(&root().join("robots/emp27"))?))
+}
+
+/// Poses of a procedural motion at 50 Hz, the same for the same seed.
+pub fn poses(seed: u64, count: usize) -> Vec<KeyNodeFrame> {
+    skills::medley(seed)
+        .resampled(50.0)
+        .frames
+        .into_iter()
+        .cycle()
+        .take(count)
+        .collect()
+}
+
+/// Waits for a step of a test, but not forever.
+///
+/// # Errors
+/// When the step takes longer than any machine should need.
+pub async fn within<T>(what: &str, step: impl Future<Output = T>) -> anyhow::Result<T> {
+    tokio::time::timeout(PATIENCE, step)
+        .await
+        .with_context(|| format!("still waiting for {what}"))
+}

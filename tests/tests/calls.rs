@@ -1,0 +1,340 @@
+//! Single calls: what they answer, what they refuse, and how.
+
+use std::time::Duration;
+
+use emp_client::{Client, ClientError};
+use emp_models::retarget::{RetargetInput, Retargeter};
+use emp_proto::v1::{
+    FrameHeader, HumanPose, Position, RetargetRequest, motion_service_client::MotionServiceClient,
+};
+use emp_server::Settings;
+use emp_tests::{
+    TestServer, emp27,
+    fake::{self, Gate},
+    poses, raw, root, within,
+};
+use tonic::{Code, Request, Status, metadata::MetadataValue, transport::Channel};
+use tonic_types::StatusExt as _;
+
+/// Largest difference between a pose that was computed alone and in a batch, radians: a batch adds in another order.
+const BATCH_TOLERANCE: f32 = 1e-3;
+
+async fn raw_client(server: &TestServer) -> MotionServiceClient<Channel> {
+    MotionServiceClient::connect(server.url())
+        .await
+        .expect("connected")
+}
+
+fn request(pose: Option<HumanPose>) -> RetargetRequest {
+    RetargetRequest {
+        robot: "emp27".to_owned(),
+        pose,
+        ..RetargetRequest::default()
+    }
+}
+
+fn good_pose() -> HumanPose {
+    raw::pose(&fake::pose(0.1))
+}
+
+fn fake_server(settings: Settings, gate: &Gate) -> anyhow::Result<TestServer> {
+    let catalog = fake::catalog(&settings, &emp27()?, gate)?;
+    TestServer::start(settings, catalog)
+}
+
+fn wrong_field(status: &Status) -> String {
+    assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
+    let details = status.get_error_details();
+    assert_eq!(details.error_info().expect("ErrorInfo").domain, "emp.v1");
+    details.bad_request().expect("BadRequest").field_violations[0]
+        .field
+        .clone()
+}
+
+#[tokio::test]
+async fn real_weights_answer_as_in_process_and_batches_as_single() -> anyhow::Result<()> {
+    let weights = root().join("models/weights/emp27-retargeter.safetensors");
+    let model = Retargeter::load(&weights, emp27()?)?;
+    let server = TestServer::start_real(Settings::default())?;
+    let client = Client::connect(&server.url()).await?;
+    let poses = poses(7, 64);
+    for refine in [false, true] {
+        let calls: Vec<_> = poses
+            .iter()
+            .cloned()
+            .map(|pose| {
+                let client = client.clone();
+                tokio::spawn(async move { client.retarget("emp27", &pose, refine).await })
+            })
+            .collect();
+        let mut largest_batch = 0;
+        for (pose, call) in poses.iter().zip(calls) {
+            let answer = within("an answer", call).await???;
+            let input = RetargetInput {
+                frame: pose.clone(),
+                refine,
+                previous: None,
+            };
+            let alone = model.retarget(&[input])?.remove(0);
+            assert_eq!(answer.joint_angles.len(), alone.angles.len());
+            for (served, expected) in answer.joint_angles.iter().zip(&alone.angles) {
+                assert!(
+                    (served - expected).abs() <= BATCH_TOLERANCE,
+                    "{served} for {expected}"
+                );
+            }
+            assert!((answer.direction_error - alone.direction_error).abs() <= BATCH_TOLERANCE);
+            largest_batch = largest_batch.max(answer.batch_size);
+        }
+        assert!(largest_batch > 1, "64 calls at once never met in a batch");
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn the_model_service_says_what_is_served() -> anyhow::Result<()> {
+    let server = TestServer::start_real(Settings::default())?;
+    let client = Client::connect(&server.url()).await?;
+    let robot = emp27()?;
+    let models = client.models().await?;
+    let model = models
+        .iter()
+        .find(|model| model.robot == "emp27")
+        .expect("a model for emp27");
+    assert_eq!(*model, client.model(&model.name).await?);
+    assert_eq!(model.weights_sha256.len(), 64);
+    let served = client.robot("emp27").await?;
+    assert_eq!(served.control_rate, robot.control_rate_hz());
+    let names: Vec<_> = served.goal_joints.iter().map(|joint| &joint.name).collect();
+    assert!(names.iter().copied().eq(&model.joint_names));
+    for (served, joint) in served
+        .goal_joints
+        .iter()
+        .chain(&served.leg_joints)
+        .zip(robot.goal_joints().iter().chain(robot.leg_joints()))
+    {
+        assert_eq!(served.name, joint.name);
+        assert_eq!([served.lower_limit, served.upper_limit], joint.range);
+        assert_eq!([served.kp, served.kd], [joint.kp, joint.kd]);
+    }
+    assert_eq!(served.key_nodes.len(), emp_motion::KEY_NODES);
+    for error in [
+        client.robot("nobody").await.err(),
+        client.model("nothing").await.err(),
+    ] {
+        let error: ClientError = error.expect("refused");
+        assert_eq!(
+            (error.code(), error.reason().as_deref()),
+            (Some(Code::NotFound), Some("NOT_FOUND"))
+        );
+        assert!(
+            error.to_string().contains("emp27"),
+            "it says what there is: {error}"
+        );
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn wrong_fields_are_refused_by_name() -> anyhow::Result<()> {
+    let server = fake_server(Settings::default(), &Gate::open())?;
+    let mut client = raw_client(&server).await;
+    let far = Some(Position {
+        x: 1e6,
+        y: 0.0,
+        z: 0.0,
+    });
+    let nan = Some(Position {
+        x: 0.0,
+        y: f32::NAN,
+        z: 0.0,
+    });
+    let cases = [
+        (
+            "robot",
+            RetargetRequest {
+                robot: "emp99".to_owned(),
+                ..request(Some(good_pose()))
+            },
+        ),
+        (
+            "model",
+            RetargetRequest {
+                model: "other".to_owned(),
+                ..request(Some(good_pose()))
+            },
+        ),
+        (
+            "model_version",
+            RetargetRequest {
+                model_version: "0".to_owned(),
+                ..request(Some(good_pose()))
+            },
+        ),
+        ("pose", request(None)),
+        (
+            "pose.left_wrist",
+            request(Some(HumanPose {
+                left_wrist: None,
+                ..good_pose()
+            })),
+        ),
+        (
+            "pose.left_wrist.y",
+            request(Some(HumanPose {
+                left_wrist: nan,
+                ..good_pose()
+            })),
+        ),
+        (
+            "pose.right_elbow",
+            request(Some(HumanPose {
+                right_elbow: far,
+                ..good_pose()
+            })),
+        ),
+        (
+            "pose.torso",
+            request(Some(HumanPose {
+                torso: good_pose().waist,
+                ..good_pose()
+            })),
+        ),
+        (
+            "pose.left_wrist_orientation",
+            request(Some(HumanPose {
+                left_wrist_orientation: Some(Default::default()),
+                ..good_pose()
+            })),
+        ),
+    ];
+    for (field, request) in cases {
+        let status = client.retarget(request).await.expect_err("refused");
+        assert_eq!(wrong_field(&status), field);
+    }
+    let answer = client
+        .retarget(request(Some(good_pose())))
+        .await?
+        .into_inner();
+    assert_eq!(
+        answer.result.expect("a result").joint_angles,
+        [fake::expected(&fake::pose(0.1)); 15]
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn an_oversize_message_is_refused() -> anyhow::Result<()> {
+    let server = fake_server(Settings::default(), &Gate::open())?;
+    let mut client = raw_client(&server).await;
+    let huge = RetargetRequest {
+        robot: "x".repeat(300 << 10),
+        ..request(Some(good_pose()))
+    };
+    let status = client.retarget(huge).await.expect_err("refused");
+    assert_eq!(status.code(), Code::OutOfRange, "{status:?}");
+    client.retarget(request(Some(good_pose()))).await?;
+    Ok(())
+}
+
+#[tokio::test]
+async fn deadlines_end_calls_with_deadline_exceeded() -> anyhow::Result<()> {
+    let gate = Gate::closed();
+    let server = fake_server(Settings::default(), &gate)?;
+    let mut client = raw_client(&server).await;
+
+    let mut call = Request::new(request(Some(good_pose())));
+    call.metadata_mut()
+        .insert("grpc-timeout", MetadataValue::from_static("500m"));
+    let status = within("the timeout", client.retarget(call))
+        .await?
+        .expect_err("late");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+    assert!(
+        status.get_error_details().error_info().is_some(),
+        "the server's own answer: {status:?}"
+    );
+
+    let budget = |seconds, nanos| FrameHeader {
+        time_budget: Some(prost_types::Duration { seconds, nanos }),
+        ..FrameHeader::default()
+    };
+    for header in [budget(0, 50_000_000), budget(0, 0)] {
+        let call = RetargetRequest {
+            header: Some(header),
+            ..request(Some(good_pose()))
+        };
+        let status = within("the budget's end", client.retarget(call))
+            .await?
+            .expect_err("late");
+        assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+    }
+    let call = RetargetRequest {
+        header: Some(budget(-1, 0)),
+        ..request(Some(good_pose()))
+    };
+    assert_eq!(
+        wrong_field(&client.retarget(call).await.expect_err("refused")),
+        "header.time_budget"
+    );
+
+    let mut call = Request::new(request(Some(good_pose())));
+    call.metadata_mut()
+        .insert("grpc-timeout", MetadataValue::from_static("soon"));
+    assert_eq!(
+        wrong_field(&client.retarget(call).await.expect_err("refused")),
+        "grpc-timeout"
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_full_queue_refuses_calls_and_says_when_to_come_back() -> anyhow::Result<()> {
+    let gate = Gate::closed();
+    let mut settings = Settings::default();
+    settings.batching.queue = 1.try_into()?;
+    let server = fake_server(settings, &gate)?;
+    let client = raw_client(&server).await;
+    let call = || {
+        let mut client = client.clone();
+        tokio::spawn(async move { client.retarget(request(Some(good_pose()))).await })
+    };
+    let in_model = call();
+    within("the model to be busy", gate.has_entered(1)).await?;
+    // One of these waits in the queue, the other finds it full; which is which is up to the network.
+    let (one, other) = (call(), call());
+    let mut one_is_refused = None;
+    within("a refusal", async {
+        while one_is_refused.is_none() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+            one_is_refused = one
+                .is_finished()
+                .then_some(true)
+                .or(other.is_finished().then_some(false));
+        }
+    })
+    .await?;
+    let (refused, waiting) = if one_is_refused == Some(true) {
+        (one, other)
+    } else {
+        (other, one)
+    };
+    let status = refused.await?.expect_err("no room");
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status:?}");
+    let details = status.get_error_details();
+    assert!(
+        details
+            .retry_info()
+            .and_then(|info| info.retry_delay)
+            .is_some_and(|delay| !delay.is_zero())
+    );
+    assert_eq!(
+        details.error_info().expect("ErrorInfo").reason,
+        "OVERLOADED"
+    );
+    gate.let_batches_pass();
+    for call in [in_model, waiting] {
+        within("an answer", call).await???;
+    }
+    Ok(())
+}

@@ -65,6 +65,11 @@ impl Canvas {
         }
     }
 
+    /// A filled circle.
+    pub(super) fn disc(&mut self, center: Point, radius: f32, rgb: Rgb) {
+        self.ellipse(center, (radius, radius), rgb);
+    }
+
     /// One line of text; `at` is on its base line, `size` the font's height in pixels.
     pub(super) fn text(&mut self, at: Point, size: f32, align: Align, rgb: Rgb, text: &str) {
         let scale = size / f32::from(self.font.units_per_em());

@@ -14,10 +14,11 @@ pub(super) enum Part {
 
 /// A shape in the pelvis frame, metres.
 pub(super) enum Shape {
-    /// A round rod through points.
+    /// A round rod through points, and the joints that show on it.
     Rod {
         points: Vec<Vector3<f32>>,
         width: f32,
+        joints: Vec<Vector3<f32>>,
     },
     /// A slab with round corners.
     Slab {
@@ -33,34 +34,59 @@ pub(super) struct Figure {
     pub(super) shapes: Vec<(Part, Shape)>,
 }
 
-/// The points of one leg from the hip to the ankle, then heel and toe, in the pelvis frame, metres.
+/// The points of one leg in the pelvis frame, metres: its joints from the hip down, then heel and toes.
 pub(crate) type Leg = Vec<Vector3<f32>>;
 
+/// How many points of a leg follow its last joint.
+const SOLE: usize = 2;
+
 impl Figure {
-    /// A body from its key nodes; legs only where they are known.
-    pub(super) fn new(frame: &KeyNodeFrame, legs: Option<&[Leg; 2]>) -> Self {
+    /// A person from the key nodes alone.
+    pub(super) fn person(frame: &KeyNodeFrame) -> Self {
+        Self::with_arms(frame, false)
+    }
+
+    /// A robot: with legs, and with joints that show.
+    pub(super) fn robot(frame: &KeyNodeFrame, legs: &[Leg; 2]) -> Self {
+        let mut figure = Self::with_arms(frame, true);
+        let size = shoulder_width(frame);
+        for side in Side::BOTH {
+            figure.leg(&legs[side as usize], side, size);
+        }
+        figure
+    }
+
+    fn with_arms(frame: &KeyNodeFrame, joints: bool) -> Self {
         let mut figure = Self { shapes: Vec::new() };
         // All widths follow the body's own size.
         let size = shoulder_width(frame);
         figure.trunk(frame, size);
         for side in Side::BOTH {
-            if let Some(legs) = legs {
-                let points = legs[side as usize].clone();
-                figure.add(
-                    Part::Limb(side),
-                    Shape::Rod {
-                        points,
-                        width: 0.22 * size,
-                    },
-                );
-            }
-            figure.arm(frame, side, size);
+            figure.arm(frame, side, size, joints);
         }
         figure
     }
 
     fn add(&mut self, part: Part, shape: Shape) {
         self.shapes.push((part, shape));
+    }
+
+    fn rod(&mut self, part: Part, points: &[Vector3<f32>], width: f32, joints: &[Vector3<f32>]) {
+        self.add(
+            part,
+            Shape::Rod {
+                points: points.to_vec(),
+                width,
+                joints: joints.to_vec(),
+            },
+        );
+    }
+
+    fn leg(&mut self, leg: &Leg, side: Side, size: f32) {
+        let (part, width) = (Part::Limb(side), 0.22 * size);
+        let Some(knee) = knee(leg) else { return };
+        self.rod(part, &leg[..=knee], width, &[leg[0], leg[knee]]);
+        self.rod(part, &leg[knee..], width, &[leg[knee]]);
     }
 
     fn trunk(&mut self, frame: &KeyNodeFrame, size: f32) {
@@ -86,14 +112,8 @@ impl Figure {
             .cross(&spine)
             .try_normalize(1e-6)
             .unwrap_or_else(Vector3::x);
-        let throat = vec![neck, neck + spine * (0.35 * size)];
-        self.add(
-            Part::Middle,
-            Shape::Rod {
-                points: throat,
-                width: 0.2 * size,
-            },
-        );
+        let throat = [neck, neck + spine * (0.35 * size)];
+        self.rod(Part::Middle, &throat, 0.2 * size, &[]);
         self.add(
             Part::Middle,
             Shape::Ball {
@@ -102,60 +122,41 @@ impl Figure {
             },
         );
         // A nose shows which way the body faces.
-        let nose = vec![
+        let nose = [
             head + forward * (0.2 * size),
             head + forward * (0.36 * size),
         ];
-        self.add(
-            Part::Middle,
-            Shape::Rod {
-                points: nose,
-                width: 0.1 * size,
-            },
-        );
+        self.rod(Part::Middle, &nose, 0.1 * size, &[]);
     }
 
-    fn arm(&mut self, frame: &KeyNodeFrame, side: Side, size: f32) {
+    fn arm(&mut self, frame: &KeyNodeFrame, side: Side, size: f32, joints: bool) {
         let part = Part::Limb(side);
         let [shoulder, elbow, wrist] = side.arm().map(|node| frame.position(node));
-        self.add(
+        let shown = |all: &[Vector3<f32>]| if joints { all.to_vec() } else { Vec::new() };
+        self.rod(
             part,
-            Shape::Rod {
-                points: vec![shoulder, elbow],
-                width: 0.2 * size,
-            },
+            &[shoulder, elbow],
+            0.2 * size,
+            &shown(&[shoulder, elbow]),
         );
-        self.add(
-            part,
-            Shape::Rod {
-                points: vec![elbow, wrist],
-                width: 0.17 * size,
-            },
-        );
+        self.rod(part, &[elbow, wrist], 0.17 * size, &shown(&[elbow, wrist]));
         match frame.wrist_rotations[side as usize] {
             Some(rotation) => {
                 let [fingers, thumb] = [rotation * Vector3::x(), rotation * Vector3::z()];
                 let palm = wrist + fingers * (0.2 * size);
-                self.add(
+                self.rod(
                     part,
-                    Shape::Rod {
-                        points: vec![wrist, wrist + fingers * (0.42 * size)],
-                        width: 0.12 * size,
-                    },
+                    &[wrist, wrist + fingers * (0.42 * size)],
+                    0.12 * size,
+                    &shown(&[wrist]),
                 );
-                self.add(
-                    part,
-                    Shape::Rod {
-                        points: vec![palm, palm + thumb * (0.2 * size)],
-                        width: 0.08 * size,
-                    },
-                );
+                self.rod(part, &[palm, palm + thumb * (0.2 * size)], 0.08 * size, &[]);
             }
             None => self.add(
                 part,
                 Shape::Ball {
                     center: wrist,
-                    radius: 0.14 * size,
+                    radius: 0.12 * size,
                 },
             ),
         }
@@ -180,6 +181,15 @@ impl Shape {
             Self::Ball { radius, .. } => *radius,
         }
     }
+}
+
+/// Index of the joint that lies farthest from the line between the leg's first and last joint.
+fn knee(leg: &Leg) -> Option<usize> {
+    let joints = &leg[..leg.len().checked_sub(SOLE)?];
+    let (first, last) = (joints.first()?, joints.last()?);
+    let along = (last - first).try_normalize(1e-6)?;
+    let bend = |index: &usize| (joints[*index] - first).cross(&along).norm();
+    (0..joints.len()).max_by(|a, b| bend(a).total_cmp(&bend(b)))
 }
 
 fn shoulders(frame: &KeyNodeFrame) -> [Vector3<f32>; 2] {

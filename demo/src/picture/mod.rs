@@ -5,6 +5,5 @@ mod figure;
 mod moments;
 mod sheet;
 
-pub(crate) use figure::Leg;
 pub(crate) use moments::differing;
 pub(crate) use sheet::{Moment, Sheet};

@@ -49,3 +49,35 @@ fn distance(a: &KeyNodeFrame, b: &KeyNodeFrame) -> f32 {
     .iter()
     .sum()
 }
+
+#[cfg(test)]
+mod tests {
+    use emp_motion::skills::{self, Skill};
+
+    use super::*;
+
+    #[test]
+    fn moments_are_in_order_apart_and_cover_the_farthest_pose() {
+        let clip = skills::medley(3);
+        let moments = differing(&clip.frames, 8);
+        assert_eq!(moments.len(), 8);
+        let gap = clip.frames.len() / 24;
+        assert!(
+            moments.windows(2).all(|pair| pair[1] >= pair[0] + gap),
+            "{moments:?}"
+        );
+        let reach = |index: &usize| distance(&clip.frames[*index], &clip.frames[0]);
+        let farthest = (0..clip.frames.len())
+            .map(|index| reach(&index))
+            .fold(0.0, f32::max);
+        let shown = moments.iter().map(reach).fold(0.0, f32::max);
+        assert!(shown > 0.9 * farthest, "{shown} of {farthest}");
+    }
+
+    #[test]
+    fn a_short_motion_has_as_many_moments_as_frames() {
+        let frames = &skills::generate(Skill::Wave, 1).frames[..3];
+        assert_eq!(differing(frames, 8), [0, 1, 2]);
+        assert!(differing(&[], 8).is_empty());
+    }
+}

@@ -20,8 +20,12 @@ const COLUMNS: usize = 4;
 const CELL_WIDTH: f32 = 400.0;
 const MARGIN: f32 = 28.0;
 const HEADER: f32 = 110.0;
-const CAPTION: f32 = 64.0;
+const CAPTION: f32 = 70.0;
 const GAP: f32 = 20.0;
+/// Between a cell's border and its text, pixels.
+const INSET: f32 = 16.0;
+/// Width of the edge around shapes, pixels.
+const EDGE: f32 = 3.0;
 /// Free space around the figures of a cell, pixels.
 const PADDING: f32 = 24.0;
 
@@ -87,8 +91,8 @@ impl Sheet<'_> {
 
 impl Moment {
     fn views(&self, camera: &Camera) -> [View; 2] {
-        let human = Figure::new(&self.human, None);
-        let robot = Figure::new(&self.robot, Some(&self.legs));
+        let human = Figure::person(&self.human);
+        let robot = Figure::robot(&self.robot, &self.legs);
         [human, robot].map(|figure| View::new(&figure, camera))
     }
 }
@@ -145,7 +149,7 @@ struct FlatShape {
 
 /// How the points of a flat shape are joined; sizes in metres.
 enum Kind {
-    Rod { width: f32 },
+    Rod { width: f32, joints: Vec<Point> },
     Slab { rounding: f32 },
     Ball { radius: f32 },
 }
@@ -207,7 +211,13 @@ impl View {
             let depths = shape.points().iter().map(|point| camera.depth(point));
             let depth = depths.sum::<f32>() / shape.points().len() as f32;
             let kind = match shape {
-                Shape::Rod { width, .. } => Kind::Rod { width: *width },
+                Shape::Rod { width, joints, .. } => {
+                    let joints = joints.iter().map(|joint| camera.project(joint)).collect();
+                    Kind::Rod {
+                        width: *width,
+                        joints,
+                    }
+                }
                 Shape::Slab { rounding, .. } => Kind::Slab {
                     rounding: *rounding,
                 },
@@ -230,14 +240,18 @@ impl View {
         for shape in &self.shapes {
             let points: Vec<Point> = shape.points.iter().map(place).collect();
             // An edge in the colour of the background parts a shape from what lies behind it.
-            for (edge, color) in [(3.0, PANEL), (0.0, shape.color)] {
-                match shape.kind {
-                    Kind::Rod { width } => canvas.line(&points, width * scale + 2.0 * edge, color),
-                    Kind::Slab { rounding } => canvas.area(&points, rounding * scale + edge, color),
-                    Kind::Ball { radius } => {
-                        let radius = radius * scale + edge;
-                        canvas.ellipse(points[0], (radius, radius), color);
+            for (edge, color) in [(EDGE, PANEL), (0.0, shape.color)] {
+                match &shape.kind {
+                    Kind::Rod { width, .. } => {
+                        canvas.line(&points, width * scale + 2.0 * edge, color)
                     }
+                    Kind::Slab { rounding } => canvas.area(&points, rounding * scale + edge, color),
+                    Kind::Ball { radius } => canvas.disc(points[0], radius * scale + edge, color),
+                }
+            }
+            if let Kind::Rod { width, joints } = &shape.kind {
+                for joint in joints {
+                    canvas.disc(place(joint), 0.22 * width * scale, PANEL);
                 }
             }
         }
@@ -252,72 +266,226 @@ fn tint(part: Part) -> Rgb {
     }
 }
 
-/// Where the cells are, and how large a metre is: the same for all figures.
+/// Where the bands are, and how large a metre is: the same for all figures.
 struct Layout {
     width: f32,
     height: f32,
     scale: f32,
-    cell_height: f32,
+    bands: Vec<Band>,
+}
+
+/// A row of cells, and what its figures span.
+struct Band {
+    top: f32,
+    height: f32,
     human: Bounds,
     robot: Bounds,
 }
 
 impl Layout {
     fn new(pairs: &[[View; 2]]) -> Self {
+        let half_width = pairs
+            .iter()
+            .flatten()
+            .map(|view| view.bounds.half_width())
+            .fold(0.0, f32::max);
+        let scale = (CELL_WIDTH / 2.0 - PADDING) / half_width;
+        let mut top = HEADER;
+        let mut bands = Vec::new();
+        for row in pairs.chunks(COLUMNS) {
+            let band = Band::new(row, top, scale);
+            top += band.height + GAP;
+            bands.push(band);
+        }
+        let columns = pairs.len().min(COLUMNS) as f32;
+        let width = 2.0 * MARGIN + columns * CELL_WIDTH + (columns - 1.0) * GAP;
+        Self {
+            width,
+            height: top - GAP + MARGIN,
+            scale,
+            bands,
+        }
+    }
+
+    fn draw(&self, canvas: &mut Canvas, index: usize, moment: &Moment, [human, robot]: &[View; 2]) {
+        let Band {
+            top,
+            height,
+            human: human_bounds,
+            robot: robot_bounds,
+        } = &self.bands[index / COLUMNS];
+        let column = index % COLUMNS;
+        let left = MARGIN + column as f32 * (CELL_WIDTH + GAP);
+        let right = left + CELL_WIDTH;
+        canvas.area(
+            &[
+                (left, *top),
+                (right, *top),
+                (right, top + height),
+                (left, top + height),
+            ],
+            0.0,
+            PANEL,
+        );
+        caption(canvas, (left, *top), moment);
+
+        let middle = left + CELL_WIDTH / 2.0;
+        let human_top = top + CAPTION + PADDING;
+        let human_bottom = human_top + human_bounds.height() * self.scale;
+        let robot_top = human_bottom + 1.5 * PADDING;
+        let robot_bottom = robot_top + robot_bounds.height() * self.scale;
+        if column == 0 {
+            canvas.text(
+                (left + INSET, human_bottom),
+                22.0,
+                Align::Left,
+                FAINT,
+                "person",
+            );
+            canvas.text(
+                (left + INSET, robot_bottom),
+                22.0,
+                Align::Left,
+                FAINT,
+                "robot",
+            );
+        }
+        canvas.ellipse(
+            (middle, robot_bottom - 6.0),
+            (CELL_WIDTH * 0.24, 12.0),
+            GROUND,
+        );
+        human.draw(
+            canvas,
+            (middle, human_top + human_bounds.top * self.scale),
+            self.scale,
+        );
+        robot.draw(
+            canvas,
+            (middle, robot_top + robot_bounds.top * self.scale),
+            self.scale,
+        );
+    }
+}
+
+impl Band {
+    fn new(pairs: &[[View; 2]], top: f32, scale: f32) -> Self {
         let [human, robot] = [0, 1].map(|row| {
             pairs
                 .iter()
                 .fold(Bounds::NONE, |bounds, pair| bounds.union(pair[row].bounds))
         });
-        let scale = (CELL_WIDTH / 2.0 - PADDING) / human.half_width().max(robot.half_width());
-        let cell_height = CAPTION + (human.height() + robot.height()) * scale + 3.0 * PADDING;
-        let rows = pairs.len().div_ceil(COLUMNS) as f32;
-        let columns = pairs.len().min(COLUMNS) as f32;
+        let height = CAPTION + (human.height() + robot.height()) * scale + 3.5 * PADDING;
         Self {
-            width: 2.0 * MARGIN + columns * CELL_WIDTH + (columns - 1.0) * GAP,
-            height: HEADER + rows * (cell_height + GAP) - GAP + MARGIN,
-            scale,
-            cell_height,
+            top,
+            height,
             human,
             robot,
         }
     }
+}
 
-    fn draw(&self, canvas: &mut Canvas, index: usize, moment: &Moment, [human, robot]: &[View; 2]) {
-        let left = MARGIN + (index % COLUMNS) as f32 * (CELL_WIDTH + GAP);
-        let top = HEADER + (index / COLUMNS) as f32 * (self.cell_height + GAP);
-        let corners = [
-            (0.0, 0.0),
-            (CELL_WIDTH, 0.0),
-            (CELL_WIDTH, self.cell_height),
-            (0.0, self.cell_height),
-        ];
-        canvas.area(&corners.map(|(x, y)| (left + x, top + y)), 0.0, PANEL);
-        self.caption(canvas, (left, top), moment);
+fn caption(canvas: &mut Canvas, (left, top): Point, moment: &Moment) {
+    let right = left + CELL_WIDTH - INSET;
+    let line = top + 36.0;
+    canvas.text(
+        (left + INSET, line),
+        27.0,
+        Align::Left,
+        INK,
+        &format!("{:.1} s", moment.time),
+    );
+    canvas.text((right, line), 27.0, Align::Right, INK, &moment.name);
+    let error = format!("arm directions {:.1}° apart", moment.direction_error_deg);
+    canvas.text(
+        (left + INSET, line + 28.0),
+        21.0,
+        Align::Left,
+        FAINT,
+        &error,
+    );
+}
 
-        let middle = left + CELL_WIDTH / 2.0;
-        let human_waist = top + CAPTION + PADDING + self.human.top * self.scale;
-        human.draw(canvas, (middle, human_waist), self.scale);
+#[cfg(test)]
+mod tests {
+    use emp_motion::skills;
+    use tiny_skia::Pixmap;
 
-        let robot_top = top + CAPTION + 2.0 * PADDING + self.human.height() * self.scale;
-        let robot_waist = robot_top + self.robot.top * self.scale;
-        let feet = robot_top + self.robot.height() * self.scale;
-        canvas.ellipse((middle, feet - 6.0), (CELL_WIDTH * 0.24, 12.0), GROUND);
-        robot.draw(canvas, (middle, robot_waist), self.scale);
+    use super::*;
+
+    fn moment(time: f64) -> Moment {
+        let frame = skills::medley(1).frames[(time * 50.0) as usize].clone();
+        let leg = |y: f32| {
+            [
+                (0.0, -0.1),
+                (0.1, -0.45),
+                (0.0, -0.8),
+                (-0.1, -0.85),
+                (0.15, -0.85),
+            ]
+            .map(|(x, z)| Vector3::new(x, y, z))
+            .to_vec()
+        };
+        Moment {
+            time,
+            name: "reach-overhead".to_owned(),
+            direction_error_deg: 1.0,
+            human: frame.clone(),
+            robot: frame,
+            legs: [leg(0.1), leg(-0.1)],
+        }
     }
 
-    fn caption(&self, canvas: &mut Canvas, (left, top): Point, moment: &Moment) {
-        let inset = 16.0;
-        let time = format!("{:.1} s", moment.time);
-        canvas.text((left + inset, top + 34.0), 26.0, Align::Left, INK, &time);
-        canvas.text(
-            (left + CELL_WIDTH - inset, top + 34.0),
-            26.0,
-            Align::Right,
-            INK,
-            &moment.name,
+    fn draw(moments: &[Moment]) -> Pixmap {
+        let png = Sheet {
+            title: "title",
+            subtitle: "subtitle",
+            moments,
+        }
+        .png()
+        .unwrap();
+        Pixmap::decode_png(&png).unwrap()
+    }
+
+    #[test]
+    fn left_is_drawn_on_the_right_of_a_figure_that_faces_us() {
+        let pixels = draw(&[moment(0.0)]);
+        let center = |rgb: Rgb| {
+            let columns =
+                (0..pixels.height()).flat_map(|y| (0..pixels.width()).map(move |x| (x, y)));
+            let [red, green, blue] = rgb;
+            let found: Vec<u32> = columns
+                .filter(|&(_, y)| y > HEADER as u32)
+                .filter(|&(x, y)| {
+                    let pixel = pixels.pixel(x, y).unwrap();
+                    [pixel.red(), pixel.green(), pixel.blue()] == [red, green, blue]
+                })
+                .map(|(x, _)| x)
+                .collect();
+            assert!(found.len() > 1000, "{rgb:?}: {} pixels", found.len());
+            found.iter().sum::<u32>() / found.len() as u32
+        };
+        assert!(center(LEFT) > center(RIGHT) + 20);
+    }
+
+    #[test]
+    fn the_sheet_grows_with_its_moments() {
+        let moments: Vec<Moment> = (0..5).map(|index| moment(f64::from(index))).collect();
+        let [one, four, five] = [1, 4, 5].map(|count| draw(&moments[..count]));
+        assert!(one.width() < four.width() && four.width() == five.width());
+        assert!(five.height() > four.height() + 400);
+    }
+
+    #[test]
+    fn nothing_to_draw_is_an_error() {
+        assert!(
+            Sheet {
+                title: "",
+                subtitle: "",
+                moments: &[]
+            }
+            .png()
+            .is_err()
         );
-        let error = format!("arm directions {:.1}° apart", moment.direction_error_deg);
-        canvas.text((left + inset, top + 62.0), 20.0, Align::Left, FAINT, &error);
     }
 }

@@ -20,7 +20,7 @@ use std::{
 use anyhow::Context as _;
 use emp_motion::{KeyNodeFrame, skills};
 use emp_robot::Robot;
-use emp_server::{Catalog, Drain, ServeError, Server, Settings};
+use emp_server::{Catalog, Drain, Overrides, ServeError, Server, Settings};
 use tokio::{runtime::Runtime, task::JoinHandle};
 use tokio_util::sync::CancellationToken;
 
@@ -78,13 +78,15 @@ impl TestServer {
         })
     }
 
-    /// Starts a server with the shipped robots and weights.
+    /// Starts a server as it ships, with the robots and weights of the checkout.
     ///
     /// # Errors
     /// When nothing can be served.
-    pub fn start_real(mut settings: Settings) -> anyhow::Result<Self> {
-        settings.robots = Some(root().join("robots"));
-        settings.weights = Some(root().join("models/weights"));
+    pub fn start_real() -> anyhow::Result<Self> {
+        let settings = Settings {
+            weights: Some(weights()?),
+            ..settings()?
+        };
         let catalog = Catalog::load(&settings)?;
         Self::start(settings, catalog)
     }
@@ -133,6 +135,27 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .parent()
         .map_or_else(PathBuf::new, Path::to_owned)
+}
+
+fn settings() -> anyhow::Result<Settings> {
+    let robots = Some(root().join("robots"));
+    Ok(Settings::load(
+        None,
+        Overrides {
+            robots,
+            ..Overrides::default()
+        },
+    )?)
+}
+
+/// The folder of the weights: the checkout's, unless the environment names another for the server.
+///
+/// # Errors
+/// When the server's environment variables are wrong.
+pub fn weights() -> anyhow::Result<PathBuf> {
+    Ok(settings()?
+        .weights
+        .unwrap_or_else(|| root().join("models/weights")))
 }
 
 /// The robot that ships with the project.

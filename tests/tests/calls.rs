@@ -11,7 +11,7 @@ use emp_server::Settings;
 use emp_tests::{
     TestServer, emp27,
     fake::{self, Gate},
-    poses, raw, root, within,
+    poses, raw, weights, within,
 };
 use tonic::{Code, Request, Status, metadata::MetadataValue, transport::Channel};
 use tonic_types::StatusExt as _;
@@ -53,9 +53,9 @@ fn wrong_field(status: &Status) -> String {
 
 #[tokio::test]
 async fn real_weights_answer_as_in_process_and_batches_as_single() -> anyhow::Result<()> {
-    let weights = root().join("models/weights/emp27-retargeter.safetensors");
+    let weights = weights()?.join("emp27-retargeter.safetensors");
     let model = Retargeter::load(&weights, emp27()?)?;
-    let server = TestServer::start_real(Settings::default())?;
+    let server = TestServer::start_real()?;
     let client = Client::connect(&server.url()).await?;
     let poses = poses(7, 64);
     for refine in [false, true] {
@@ -93,7 +93,7 @@ async fn real_weights_answer_as_in_process_and_batches_as_single() -> anyhow::Re
 
 #[tokio::test]
 async fn the_model_service_says_what_is_served() -> anyhow::Result<()> {
-    let server = TestServer::start_real(Settings::default())?;
+    let server = TestServer::start_real()?;
     let client = Client::connect(&server.url()).await?;
     let robot = emp27()?;
     let models = client.models().await?;

@@ -47,7 +47,7 @@ async fn started(
 
 #[tokio::test]
 async fn all_answers_every_frame_in_order_and_half_close_flushes() -> anyhow::Result<()> {
-    let server = TestServer::start_real(Settings::default())?;
+    let server = TestServer::start_real()?;
     let client = Client::connect(&server.url()).await?;
     let robot = emp27()?;
     for (refine, smoothing) in [(false, false), (true, true)] {
@@ -439,7 +439,7 @@ async fn under_overload_open_streams_lose_frames_and_new_ones_are_refused() -> a
 
 #[tokio::test]
 async fn eight_streams_of_different_robots_run_at_once() -> anyhow::Result<()> {
-    let server = TestServer::start_real(Settings::default())?;
+    let server = TestServer::start_real()?;
     let client = Client::connect(&server.url()).await?;
     let robots: BTreeSet<String> = client
         .models()

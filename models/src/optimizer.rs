@@ -22,7 +22,12 @@ pub struct AdamConfig {
 
 impl Default for AdamConfig {
     fn default() -> Self {
-        Self { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, max_gradient_norm: 10.0 }
+        Self {
+            beta1: 0.9,
+            beta2: 0.999,
+            epsilon: 1e-8,
+            max_gradient_norm: 10.0,
+        }
     }
 }
 
@@ -45,15 +50,28 @@ impl Adam {
     /// # Errors
     /// When the map's lock is poisoned.
     pub fn new(vars: &VarMap, config: AdamConfig) -> candle_core::Result<Self> {
-        let Ok(vars) = vars.data().lock() else { bail!("the variables' lock is poisoned") };
+        let Ok(vars) = vars.data().lock() else {
+            bail!("the variables' lock is poisoned")
+        };
         let slots = vars
             .iter()
             .map(|(name, var)| {
                 let zeros = vec![0.0; var.elem_count()];
-                (name.clone(), Slot { var: var.clone(), mean: zeros.clone(), square: zeros })
+                (
+                    name.clone(),
+                    Slot {
+                        var: var.clone(),
+                        mean: zeros.clone(),
+                        square: zeros,
+                    },
+                )
             })
             .collect();
-        Ok(Self { config, slots, steps: 0 })
+        Ok(Self {
+            config,
+            slots,
+            steps: 0,
+        })
     }
 
     /// Steps taken so far.
@@ -69,8 +87,15 @@ impl Adam {
         let mut found = Vec::with_capacity(self.slots.len());
         let mut squared_norm = 0.0;
         for slot in self.slots.values() {
-            let grad = grads.get(&slot.var).map(|g| g.flatten_all()?.to_vec1::<f32>()).transpose()?;
-            squared_norm += grad.iter().flatten().map(|g| f64::from(*g).powi(2)).sum::<f64>();
+            let grad = grads
+                .get(&slot.var)
+                .map(|g| g.flatten_all()?.to_vec1::<f32>())
+                .transpose()?;
+            squared_norm += grad
+                .iter()
+                .flatten()
+                .map(|g| f64::from(*g).powi(2))
+                .sum::<f64>();
             found.push(grad);
         }
         let norm = squared_norm.sqrt();
@@ -95,8 +120,14 @@ impl Adam {
         let mut state = HashMap::new();
         for (name, slot) in &self.slots {
             let device = slot.var.device();
-            state.insert(format!("adam.mean.{name}"), Tensor::new(slot.mean.as_slice(), device)?);
-            state.insert(format!("adam.square.{name}"), Tensor::new(slot.square.as_slice(), device)?);
+            state.insert(
+                format!("adam.mean.{name}"),
+                Tensor::new(slot.mean.as_slice(), device)?,
+            );
+            state.insert(
+                format!("adam.square.{name}"),
+                Tensor::new(slot.square.as_slice(), device)?,
+            );
         }
         Ok(state)
     }
@@ -105,14 +136,24 @@ impl Adam {
     ///
     /// # Errors
     /// When a moment is missing or has another size.
-    pub fn restore(&mut self, state: &HashMap<String, Tensor>, steps: u64) -> candle_core::Result<()> {
+    pub fn restore(
+        &mut self,
+        state: &HashMap<String, Tensor>,
+        steps: u64,
+    ) -> candle_core::Result<()> {
         for (name, slot) in &mut self.slots {
             for (kind, moment) in [("mean", &mut slot.mean), ("square", &mut slot.square)] {
                 let key = format!("adam.{kind}.{name}");
-                let Some(saved) = state.get(&key) else { bail!("the checkpoint has no {key}") };
+                let Some(saved) = state.get(&key) else {
+                    bail!("the checkpoint has no {key}")
+                };
                 let saved = saved.flatten_all()?.to_vec1::<f32>()?;
                 if saved.len() != moment.len() {
-                    bail!("{key} has {} values, expected {}", saved.len(), moment.len());
+                    bail!(
+                        "{key} has {} values, expected {}",
+                        saved.len(),
+                        moment.len()
+                    );
                 }
                 *moment = saved;
             }
@@ -123,7 +164,9 @@ impl Adam {
 
     /// Forgets the moments of the given rows of a variable, after these rows were replaced.
     pub fn forget_rows(&mut self, name: &str, rows: &[u32]) {
-        let Some(slot) = self.slots.get_mut(name) else { return };
+        let Some(slot) = self.slots.get_mut(name) else {
+            return;
+        };
         let width = slot.mean.len() / slot.var.dims().first().copied().unwrap_or(1).max(1);
         for row in rows {
             let range = *row as usize * width..(*row as usize + 1) * width;
@@ -155,7 +198,11 @@ impl Slot {
             *square = beta2 * *square + (1.0 - beta2) * grad * grad;
             *value -= step * *mean / (square.sqrt() * correction + epsilon);
         }
-        self.var.set(&Tensor::from_vec(values, self.var.shape(), self.var.device())?)
+        self.var.set(&Tensor::from_vec(
+            values,
+            self.var.shape(),
+            self.var.device(),
+        )?)
     }
 }
 
@@ -184,7 +231,10 @@ mod tests {
     fn the_first_step_is_the_learning_rate() {
         let vars = variable();
         let mut adam = Adam::new(&vars, AdamConfig::default()).unwrap();
-        for (x, expected) in descend(&vars, &mut adam, 1).iter().zip([2.9, -1.9, 0.4, 0.9]) {
+        for (x, expected) in descend(&vars, &mut adam, 1)
+            .iter()
+            .zip([2.9, -1.9, 0.4, 0.9])
+        {
             assert!((x - expected).abs() < 1e-5, "{x} {expected}");
         }
     }
@@ -197,7 +247,9 @@ mod tests {
         let mut first = Adam::new(&b, AdamConfig::default()).unwrap();
         descend(&b, &mut first, 4);
         let mut second = Adam::new(&b, AdamConfig::default()).unwrap();
-        second.restore(&first.state().unwrap(), first.steps()).unwrap();
+        second
+            .restore(&first.state().unwrap(), first.steps())
+            .unwrap();
         assert_eq!(descend(&b, &mut second, 3), expected);
     }
 
@@ -206,8 +258,14 @@ mod tests {
         let vars = variable();
         let var = vars.data().lock().unwrap()["x"].clone();
         let mut adam = Adam::new(&vars, AdamConfig::default()).unwrap();
-        let grads = (var.sum_all().unwrap() * f64::NAN).unwrap().backward().unwrap();
+        let grads = (var.sum_all().unwrap() * f64::NAN)
+            .unwrap()
+            .backward()
+            .unwrap();
         assert!(adam.step(&grads, 0.1).is_err());
-        assert_eq!(var.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [3.0, -2.0, 0.5, 1.0]);
+        assert_eq!(
+            var.flatten_all().unwrap().to_vec1::<f32>().unwrap(),
+            [3.0, -2.0, 0.5, 1.0]
+        );
     }
 }

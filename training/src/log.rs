@@ -30,8 +30,13 @@ impl CsvLog {
         }
         let bytes = text.into_inner().map_err(|e| e.into_error())?;
         write_atomically(path, &bytes).with_context(|| format!("writing {}", path.display()))?;
-        let file = OpenOptions::new().append(true).open(path).with_context(|| format!("opening {}", path.display()))?;
-        Ok(Self { writer: csv::Writer::from_writer(file) })
+        let file = OpenOptions::new()
+            .append(true)
+            .open(path)
+            .with_context(|| format!("opening {}", path.display()))?;
+        Ok(Self {
+            writer: csv::Writer::from_writer(file),
+        })
     }
 
     /// Appends one row and flushes it.
@@ -40,14 +45,16 @@ impl CsvLog {
     /// When the file cannot be written.
     pub fn row(&mut self, step: u64, values: &[f64]) -> Result<()> {
         let numbers = values.iter().map(|value| format!("{value:.6}"));
-        self.writer.write_record(std::iter::once(step.to_string()).chain(numbers))?;
+        self.writer
+            .write_record(std::iter::once(step.to_string()).chain(numbers))?;
         self.writer.flush()?;
         Ok(())
     }
 }
 
 fn rows_up_to(path: &Path, columns: &[&str], last_step: u64) -> Result<Vec<csv::StringRecord>> {
-    let mut reader = csv::Reader::from_path(path).with_context(|| format!("reading {}", path.display()))?;
+    let mut reader =
+        csv::Reader::from_path(path).with_context(|| format!("reading {}", path.display()))?;
     let header = reader.headers()?.clone();
     ensure!(
         header.iter().eq(columns.iter().copied()),
@@ -57,7 +64,9 @@ fn rows_up_to(path: &Path, columns: &[&str], last_step: u64) -> Result<Vec<csv::
     // A last line that was cut off while it was written has another length and ends the log.
     let rows = reader.records().map_while(Result::ok);
     let in_range = |row: &csv::StringRecord| {
-        row.get(0).and_then(|step| step.parse::<u64>().ok()).is_some_and(|step| step <= last_step)
+        row.get(0)
+            .and_then(|step| step.parse::<u64>().ok())
+            .is_some_and(|step| step <= last_step)
     };
     Ok(rows.filter(in_range).collect())
 }

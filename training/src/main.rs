@@ -17,7 +17,11 @@ use emp_training::{
 
 /// Trains the models of the motion-filtering service, and reports on them.
 #[derive(Parser)]
-#[command(name = "emp-train", version, after_help = "Exit codes: 0 done, 1 failed, 3 interrupted with its state saved.")]
+#[command(
+    name = "emp-train",
+    version,
+    after_help = "Exit codes: 0 done, 1 failed, 3 interrupted with its state saved."
+)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -47,7 +51,9 @@ struct RobotArguments {
 impl RobotArguments {
     fn load(&self) -> Result<Arc<Robot>> {
         let folder = self.robots.join(&self.robot);
-        Ok(Arc::new(Robot::load(&folder).with_context(|| format!("loading robot {}", self.robot))?))
+        Ok(Arc::new(Robot::load(&folder).with_context(|| {
+            format!("loading robot {}", self.robot)
+        })?))
     }
 }
 
@@ -62,7 +68,7 @@ struct RetargeterArguments {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Optimiser steps.
-    #[arg(long, default_value_t = 30_000)]
+    #[arg(long, default_value_t = 12_000)]
     steps: u64,
     /// Frames a step.
     #[arg(long, default_value_t = 512)]
@@ -82,6 +88,9 @@ struct RetargeterArguments {
     /// Folder of the run's checkpoint and log [default: runs/retargeter-ROBOT].
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
+    /// Seconds between two checkpoints.
+    #[arg(long, default_value_t = 120)]
+    save_every: u64,
     /// Threads for matrix products; the weights do not depend on it.
     #[arg(long, default_value_t = 2)]
     threads: usize,
@@ -106,17 +115,40 @@ struct ReportArguments {
 }
 
 fn main() -> Result<ExitCode> {
+    // SAFETY: no other thread runs yet, so none reads the environment meanwhile.
+    unsafe { single_thread_element_wise_ops() };
     match Cli::parse().command {
         Command::Retargeter(arguments) => train_retargeter(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),
     }
 }
 
+/// Keeps candle's element-wise ops on the calling thread: its own pool waits by spinning, which costs more than half of the
+/// time where anything else runs on the machine. Matrix products have their own threads (`--threads`).
+///
+/// # Safety
+/// As [`std::env::set_var`]: no other thread may be running.
+unsafe fn single_thread_element_wise_ops() {
+    // SAFETY: the caller's promise.
+    unsafe { std::env::set_var("CANDLE_NUM_THREADS", "1") };
+}
+
 fn train_retargeter(arguments: &RetargeterArguments) -> Result<ExitCode> {
-    ensure!(arguments.batch > 0 && arguments.steps > 0, "--batch and --steps must be at least 1");
+    ensure!(
+        arguments.batch > 0 && arguments.steps > 0,
+        "--batch and --steps must be at least 1"
+    );
     let robot = arguments.robot.load()?;
-    let folder = arguments.run.clone().unwrap_or_else(|| PathBuf::from(format!("runs/retargeter-{}", robot.name())));
-    let files = RunFiles { folder, weights: arguments.out.clone() };
+    let folder = arguments
+        .run
+        .clone()
+        .unwrap_or_else(|| PathBuf::from(format!("runs/retargeter-{}", robot.name())));
+    let save_every = std::time::Duration::from_secs(arguments.save_every);
+    let files = RunFiles {
+        folder,
+        weights: arguments.out.clone(),
+        save_every,
+    };
     let settings = Settings {
         steps: arguments.steps,
         batch: arguments.batch,
@@ -127,7 +159,10 @@ fn train_retargeter(arguments: &RetargeterArguments) -> Result<ExitCode> {
     let (clips, summary) = data::load_with_summary(&arguments.motions)?;
     let dataset = Dataset::new(&clips, settings.procedural_clips, settings.seed)?;
     let (recorded, procedural) = dataset.len();
-    eprintln!("{} clips: {recorded} recorded and {procedural} procedural frames, mirrored ones included", clips.len());
+    eprintln!(
+        "{} clips: {recorded} recorded and {procedural} procedural frames, mirrored ones included",
+        clips.len()
+    );
 
     linear::set_threads(arguments.threads);
     let mut trainer = if arguments.resume {
@@ -148,7 +183,10 @@ fn train_retargeter(arguments: &RetargeterArguments) -> Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
         Outcome::Interrupted => {
-            eprintln!("interrupted at step {}; continue with --resume", trainer.steps());
+            eprintln!(
+                "interrupted at step {}; continue with --resume",
+                trainer.steps()
+            );
             Ok(ExitCode::from(3))
         }
     }
@@ -156,23 +194,31 @@ fn train_retargeter(arguments: &RetargeterArguments) -> Result<ExitCode> {
 
 fn report_retargeter(arguments: &ReportArguments) -> Result<ExitCode> {
     let robot = arguments.robot.load()?;
-    let weights = arguments
-        .weights
-        .clone()
-        .unwrap_or_else(|| PathBuf::from(format!("models/weights/{}-retargeter.safetensors", robot.name())));
+    let weights = arguments.weights.clone().unwrap_or_else(|| {
+        PathBuf::from(format!(
+            "models/weights/{}-retargeter.safetensors",
+            robot.name()
+        ))
+    });
     let retargeter = Retargeter::load(&weights, robot)?;
     let clips = if arguments.motions.is_empty() {
         let library = emp_motion::skills::library(1, 60);
-        library.iter().map(|clip| clip.resampled(data::RATE)).collect()
+        library
+            .iter()
+            .map(|clip| clip.resampled(data::RATE))
+            .collect()
     } else {
         data::load_clips(&arguments.motions)?
     };
     let bar = run::spinner();
-    let report = report::report(&retargeter, &clips, |method| bar.set_message(method.to_owned()))?;
+    let report = report::report(&retargeter, &clips, |method| {
+        bar.set_message(method.to_owned())
+    })?;
     bar.finish_and_clear();
     let json = serde_json::to_string_pretty(&report)?;
     if let Some(out) = &arguments.out {
-        write_atomically(out, json.as_bytes()).with_context(|| format!("writing {}", out.display()))?;
+        write_atomically(out, json.as_bytes())
+            .with_context(|| format!("writing {}", out.display()))?;
     }
     if arguments.json {
         println!("{json}");

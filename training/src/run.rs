@@ -41,8 +41,12 @@ impl Interrupt {
 
 /// A progress bar on stderr, hidden where stderr is no terminal.
 pub fn progress(steps: u64, done: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{elapsed_precise} {wide_bar} {pos}/{len} ({per_sec}, {eta}) {msg}");
-    let bar = ProgressBar::new(steps).with_position(done).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    let style = ProgressStyle::with_template(
+        "{elapsed_precise} {wide_bar} {pos}/{len} ({per_sec}, {eta}) {msg}",
+    );
+    let bar = ProgressBar::new(steps)
+        .with_position(done)
+        .with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
     bar.reset_eta();
     bar
 }
@@ -57,10 +61,17 @@ pub fn spinner() -> ProgressBar {
 /// The revision of the checkout that the program runs in, with `+` where files are changed; `unknown` outside one.
 pub fn git_revision() -> String {
     let git = |arguments: &[&str]| {
-        let output = Command::new("git").args(arguments).output().ok().filter(|output| output.status.success())?;
+        let output = Command::new("git")
+            .args(arguments)
+            .output()
+            .ok()
+            .filter(|output| output.status.success())?;
         Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
     };
-    match (git(&["rev-parse", "--short=12", "HEAD"]), git(&["status", "--porcelain", "--untracked-files=no"])) {
+    match (
+        git(&["rev-parse", "--short=12", "HEAD"]),
+        git(&["status", "--porcelain", "--untracked-files=no"]),
+    ) {
         (Some(revision), Some(changes)) if changes.is_empty() => revision,
         (Some(revision), _) => revision + "+",
         _ => "unknown".to_owned(),
@@ -69,5 +80,8 @@ pub fn git_revision() -> String {
 
 /// The last part of a path, for messages and metadata that must not name the machine's folders.
 pub fn base_name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+    path.file_name()
+        .unwrap_or(path.as_os_str())
+        .to_string_lossy()
+        .into_owned()
 }

@@ -52,7 +52,9 @@ impl Target {
             bones: bones.map(|bone| bone.cast()),
             // A trunk that lies on its side shows no yaw from above.
             shoulder_line: line.try_normalize(1e-3).unwrap_or_else(Vector2::y),
-            wrists: frame.wrist_rotations.map(|wrist| wrist.map(|wrist| wrist.matrix().cast())),
+            wrists: frame
+                .wrist_rotations
+                .map(|wrist| wrist.map(|wrist| wrist.matrix().cast())),
         }
     }
 
@@ -70,7 +72,8 @@ impl Target {
             };
             if let Some(rotation) = wrist {
                 let known = start + ROTATION_FEATURES;
-                for (feature, value) in out[known..].iter_mut().zip(rotation.as_slice()[..6].iter()) {
+                for (feature, value) in out[known..].iter_mut().zip(rotation.as_slice()[..6].iter())
+                {
                     *feature = *value as f32;
                 }
                 out[start + NODE_FEATURES - 1] = 1.0;

@@ -65,18 +65,34 @@ impl Retargeter {
     pub fn load(weights: &Path, robot: Arc<Robot>) -> Result<Self, ModelError> {
         let (metadata, tensors) = checkpoint::load(weights)?;
         metadata.check(weights, KIND, &robot)?;
-        let damaged = |reason: String| ModelError::Checkpoint { path: weights.to_owned(), reason };
+        let damaged = |reason: String| ModelError::Checkpoint {
+            path: weights.to_owned(),
+            reason,
+        };
         let config: NetworkConfig = serde_json::from_value(metadata.config.clone())
             .map_err(|e| damaged(format!("metadata field config: {e}")))?;
-        let vars = VarBuilder::from_tensors(tensors.into_iter().collect(), DType::F32, &Device::Cpu);
+        let vars =
+            VarBuilder::from_tensors(tensors.into_iter().collect(), DType::F32, &Device::Cpu);
         let network = RetargetNetwork::new(&config, &robot, &vars)
             .map_err(|e| damaged(format!("the network's tensors: {e}")))?;
-        Ok(Self { network, robot, metadata })
+        Ok(Self {
+            network,
+            robot,
+            metadata,
+        })
     }
 
     /// Wraps a network in training.
-    pub fn from_network(network: RetargetNetwork, robot: Arc<Robot>, metadata: CheckpointMetadata) -> Self {
-        Self { network, robot, metadata }
+    pub fn from_network(
+        network: RetargetNetwork,
+        robot: Arc<Robot>,
+        metadata: CheckpointMetadata,
+    ) -> Self {
+        Self {
+            network,
+            robot,
+            metadata,
+        }
     }
 
     /// The robot that the answers are for.
@@ -101,13 +117,26 @@ impl Retargeter {
     pub fn retarget(&self, inputs: &[RetargetInput]) -> Result<Vec<RetargetOutput>, ModelError> {
         let joints = self.robot.goal_joints().len();
         for (index, input) in inputs.iter().enumerate() {
-            input.frame.validate().map_err(|e| ModelError::Frame { index, reason: e.to_string() })?;
-            if let Some(previous) = input.previous.as_ref().filter(|previous| previous.len() != joints) {
-                let reason = format!("the previous answer has {} joints, expected {joints}", previous.len());
+            input.frame.validate().map_err(|e| ModelError::Frame {
+                index,
+                reason: e.to_string(),
+            })?;
+            if let Some(previous) = input
+                .previous
+                .as_ref()
+                .filter(|previous| previous.len() != joints)
+            {
+                let reason = format!(
+                    "the previous answer has {} joints, expected {joints}",
+                    previous.len()
+                );
                 return Err(ModelError::Frame { index, reason });
             }
         }
-        let targets: Vec<Target> = inputs.iter().map(|input| Target::new(&input.frame)).collect();
+        let targets: Vec<Target> = inputs
+            .iter()
+            .map(|input| Target::new(&input.frame))
+            .collect();
         let (angles, _) = self.predict(&targets)?;
         let mut solver = Solver::new(&self.robot);
         let answers = inputs.iter().zip(&targets).zip(angles.chunks(joints));
@@ -134,7 +163,11 @@ impl Retargeter {
         for target in targets {
             target.write_features(&mut features);
         }
-        let features = Tensor::from_vec(features, (targets.len(), KEY_NODES, NODE_FEATURES), &Device::Cpu)?;
+        let features = Tensor::from_vec(
+            features,
+            (targets.len(), KEY_NODES, NODE_FEATURES),
+            &Device::Cpu,
+        )?;
         Ok(self.network.predict(&features)?)
     }
 
@@ -146,7 +179,8 @@ impl Retargeter {
             direction_error: (errors.iter().sum::<f64>() / errors.len() as f64) as f32,
             at_limit: joints
                 .filter(|(i, joint)| {
-                    angles[*i] <= joint.range[0] + AT_LIMIT || angles[*i] >= joint.range[1] - AT_LIMIT
+                    angles[*i] <= joint.range[0] + AT_LIMIT
+                        || angles[*i] >= joint.range[1] - AT_LIMIT
                 })
                 .map(|(i, _)| i)
                 .collect(),
@@ -155,7 +189,12 @@ impl Retargeter {
 }
 
 /// Lowers the objective from the network's answer, or from the stream's previous one where that starts lower.
-fn refine(solver: &mut Solver<'_>, target: &Target, angles: &mut Vec<f64>, previous: Option<&[f32]>) {
+fn refine(
+    solver: &mut Solver<'_>,
+    target: &Target,
+    angles: &mut Vec<f64>,
+    previous: Option<&[f32]>,
+) {
     if let Some(previous) = previous {
         let previous: Vec<f64> = previous.iter().map(|angle| f64::from(*angle)).collect();
         if solver.objective(target, &previous) < solver.objective(target, angles) {

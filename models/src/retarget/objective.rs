@@ -52,9 +52,15 @@ pub struct Effort {
 
 impl Effort {
     /// What serving spends on a frame.
-    pub const REFINE: Self = Self { steps: 8, tolerance: 1e-3 };
+    pub const REFINE: Self = Self {
+        steps: 8,
+        tolerance: 1e-3,
+    };
     /// Converged: the reference that the network and the refinement are measured against.
-    pub const CONVERGE: Self = Self { steps: 300, tolerance: 1e-10 };
+    pub const CONVERGE: Self = Self {
+        steps: 300,
+        tolerance: 1e-10,
+    };
 }
 
 /// Normal equations `(JᵀJ + μ I) δ = −Jᵀ r` over the goal joints.
@@ -153,14 +159,21 @@ impl<'a> Solver<'a> {
     }
 
     fn terms(&self) -> Terms<'_> {
-        Terms { robot: self.robot, frame: &self.frame, bones: &self.bones, shoulder_line: &self.shoulder_line }
+        Terms {
+            robot: self.robot,
+            frame: &self.frame,
+            bones: &self.bones,
+            shoulder_line: &self.shoulder_line,
+        }
     }
 
     /// The objective at `angles` (goal order, radians).
     pub fn objective(&mut self, target: &Target, angles: &[f64]) -> f64 {
         self.frame.update(angles);
         let mut sum = 0.0;
-        self.terms().visit(target, angles, |residual, _, _| sum += residual.norm_squared());
+        self.terms().visit(target, angles, |residual, _, _| {
+            sum += residual.norm_squared()
+        });
         sum
     }
 
@@ -235,7 +248,11 @@ impl<'a> Solver<'a> {
             .collect();
         let solved = self.normal.solve(damping, &free);
         for (i, (trial, joint)) in self.trial.iter_mut().zip(joints).enumerate() {
-            let step = if solved && free[i] { self.normal.step[i] } else { 0.0 };
+            let step = if solved && free[i] {
+                self.normal.step[i]
+            } else {
+                0.0
+            };
             *trial = (angles[i] + step).clamp(joint.range[0], joint.range[1]);
         }
     }
@@ -247,8 +264,19 @@ impl<'a> Solver<'a> {
         let mut sum = 0.0;
         let normal = &mut self.normal;
         let mut derivatives = std::mem::take(&mut self.derivatives);
-        let Self { robot, frame, bones, shoulder_line, .. } = self;
-        let terms = Terms { robot, frame, bones, shoulder_line };
+        let Self {
+            robot,
+            frame,
+            bones,
+            shoulder_line,
+            ..
+        } = self;
+        let terms = Terms {
+            robot,
+            frame,
+            bones,
+            shoulder_line,
+        };
         terms.visit(target, angles, |residual, joints, derivative| {
             sum += residual.norm_squared();
             derivatives.clear();
@@ -269,7 +297,11 @@ struct Bone {
 
 impl Bone {
     fn new((from, to): (KeyNode, KeyNode), frame: &FrameKinematics) -> Self {
-        let mut joints = [frame.joints_moving(from as usize), frame.joints_moving(to as usize)].concat();
+        let mut joints = [
+            frame.joints_moving(from as usize),
+            frame.joints_moving(to as usize),
+        ]
+        .concat();
         joints.sort_unstable();
         joints.dedup();
         Self { from, to, joints }
@@ -278,7 +310,8 @@ impl Bone {
     /// Unit direction and length, after scaling each axis.
     fn direction(&self, frame: &FrameKinematics, axes: &Vector3<f64>) -> (Vector3<f64>, f64) {
         let positions = frame.positions();
-        let bone = (positions[self.to as usize] - positions[self.from as usize]).component_mul(axes);
+        let bone =
+            (positions[self.to as usize] - positions[self.from as usize]).component_mul(axes);
         let length = bone.norm().max(SHORTEST_BONE);
         (bone / length, length)
     }
@@ -324,19 +357,33 @@ impl Terms<'_> {
         let level = Vector3::new(1.0, 1.0, 0.0);
         let wanted = target.shoulder_line.push(0.0);
         let (direction, length) = self.shoulder_line.direction(self.frame, &level);
-        visit((direction - wanted) * scale, &self.shoulder_line.joints, &|j| {
-            let change = self.shoulder_line.derivative(self.frame, j).component_mul(&level);
-            turn_of(&direction, &change) * (scale / length)
-        });
+        visit(
+            (direction - wanted) * scale,
+            &self.shoulder_line.joints,
+            &|j| {
+                let change = self
+                    .shoulder_line
+                    .derivative(self.frame, j)
+                    .component_mul(&level);
+                turn_of(&direction, &change) * (scale / length)
+            },
+        );
 
         let scale = weights::WRIST.sqrt();
-        for (side, node) in [KeyNode::LeftWrist, KeyNode::RightWrist].into_iter().enumerate() {
-            let Some(wanted) = target.wrists[side] else { continue };
+        for (side, node) in [KeyNode::LeftWrist, KeyNode::RightWrist]
+            .into_iter()
+            .enumerate()
+        {
+            let Some(wanted) = target.wrists[side] else {
+                continue;
+            };
             for column in 0..3 {
                 let axis: Vector3<f64> = self.frame.wrist_rotations()[side].column(column).into();
-                visit((axis - wanted.column(column)) * scale, self.frame.joints_moving(node as usize), &|j| {
-                    self.frame.direction_derivative(&axis, j) * scale
-                });
+                visit(
+                    (axis - wanted.column(column)) * scale,
+                    self.frame.joints_moving(node as usize),
+                    &|j| self.frame.direction_derivative(&axis, j) * scale,
+                );
             }
         }
 

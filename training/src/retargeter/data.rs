@@ -23,7 +23,11 @@ pub fn load_clips(folders: &[PathBuf]) -> Result<Vec<Clip>> {
         } else {
             vec![emp_motion::load(folder)?]
         };
-        ensure!(!found.is_empty(), "{}: expected motion files (.bvh, .npz), found none", folder.display());
+        ensure!(
+            !found.is_empty(),
+            "{}: expected motion files (.bvh, .npz), found none",
+            folder.display()
+        );
         clips.extend(found.iter().map(|clip| clip.resampled(RATE)));
     }
     Ok(clips)
@@ -44,8 +48,14 @@ impl Dataset {
     /// When no procedural clip is asked for: they are always in the mix.
     pub fn new(clips: &[Clip], procedural: usize, seed: u64) -> Result<Self> {
         let skills = skills::library(seed, procedural);
-        let dataset = Self { recorded: targets(clips), procedural: targets(&skills) };
-        ensure!(!dataset.procedural.is_empty(), "expected at least one procedural clip");
+        let dataset = Self {
+            recorded: targets(clips),
+            procedural: targets(&skills),
+        };
+        ensure!(
+            !dataset.procedural.is_empty(),
+            "expected at least one procedural clip"
+        );
         Ok(dataset)
     }
 
@@ -59,7 +69,11 @@ impl Dataset {
         /// Share of samples whose wrist orientations are hidden, so that the network serves sources without them.
         const FORGET_WRISTS: f64 = 0.25;
         let from_recorded = !self.recorded.is_empty() && rng.random_bool(0.5);
-        let frames = if from_recorded { &self.recorded } else { &self.procedural };
+        let frames = if from_recorded {
+            &self.recorded
+        } else {
+            &self.procedural
+        };
         let mut target = frames[rng.random_range(0..frames.len())].clone();
         if rng.random_bool(0.5) {
             vary(&mut target, rng);
@@ -73,7 +87,9 @@ impl Dataset {
 
 fn targets(clips: &[Clip]) -> Vec<Target> {
     let frames = clips.iter().flat_map(|clip| &clip.frames);
-    frames.flat_map(|frame| [Target::new(frame), Target::new(&frame.mirrored())]).collect()
+    frames
+        .flat_map(|frame| [Target::new(frame), Target::new(&frame.mirrored())])
+        .collect()
 }
 
 /// Turns trunk and arms together by some yaw, then each bone and hand by a few degrees.
@@ -112,7 +128,10 @@ fn small_rotation(angle: f64, rng: &mut impl Rng) -> Rotation3<f64> {
 pub fn load_with_summary(folders: &[PathBuf]) -> Result<(Vec<Clip>, serde_json::Value)> {
     let clips = load_clips(folders).context("reading the motions")?;
     let frames: usize = clips.iter().map(|clip| clip.frames.len()).sum();
-    let names: Vec<String> = folders.iter().map(|folder| crate::run::base_name(folder)).collect();
+    let names: Vec<String> = folders
+        .iter()
+        .map(|folder| crate::run::base_name(folder))
+        .collect();
     let summary = serde_json::json!({ "folders": names, "clips": clips.len(), "frames": frames });
     Ok((clips, summary))
 }

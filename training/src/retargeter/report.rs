@@ -3,9 +3,7 @@
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
-use emp_models::retarget::{
-    AT_LIMIT, Effort, RetargetInput, Retargeter, Smoother, Solver, Target,
-};
+use emp_models::retarget::{AT_LIMIT, Effort, RetargetInput, Retargeter, Smoother, Solver, Target};
 use emp_motion::Clip;
 use emp_robot::Robot;
 use emp_sim::SelfCollision;
@@ -60,7 +58,10 @@ impl Spread {
     fn of(mut values: Vec<f64>) -> Option<Self> {
         values.sort_by(f64::total_cmp);
         let p95 = *values.get(values.len().saturating_sub(1) * 95 / 100)?;
-        Some(Self { mean: values.iter().sum::<f64>() / values.len() as f64, p95 })
+        Some(Self {
+            mean: values.iter().sum::<f64>() / values.len() as f64,
+            p95,
+        })
     }
 }
 
@@ -95,17 +96,33 @@ struct Method {
 }
 
 const METHODS: [Method; 4] = [
-    Method { name: "converged IK", run: converged },
-    Method { name: "network", run: |retargeter, clip| answers(retargeter, clip, false, false) },
-    Method { name: "network + refine", run: |retargeter, clip| answers(retargeter, clip, true, false) },
-    Method { name: "network + refine + smoothing", run: |retargeter, clip| answers(retargeter, clip, true, true) },
+    Method {
+        name: "converged IK",
+        run: converged,
+    },
+    Method {
+        name: "network",
+        run: |retargeter, clip| answers(retargeter, clip, false, false),
+    },
+    Method {
+        name: "network + refine",
+        run: |retargeter, clip| answers(retargeter, clip, true, false),
+    },
+    Method {
+        name: "network + refine + smoothing",
+        run: |retargeter, clip| answers(retargeter, clip, true, true),
+    },
 ];
 
 /// Per-frame inverse kinematics, run to convergence from the previous frame's answer (the first from the default pose).
 fn converged(retargeter: &Retargeter, clip: &Clip) -> Result<Track> {
     let robot = retargeter.robot();
     let mut solver = Solver::new(robot);
-    let mut angles: Vec<f64> = robot.goal_joints().iter().map(|joint| joint.default).collect();
+    let mut angles: Vec<f64> = robot
+        .goal_joints()
+        .iter()
+        .map(|joint| joint.default)
+        .collect();
     let solve = |frame| {
         solver.minimise(&Target::new(frame), &mut angles, Effort::CONVERGE);
         angles.clone()
@@ -119,8 +136,14 @@ fn answers(retargeter: &Retargeter, clip: &Clip, refine: bool, smooth: bool) -> 
     let mut previous: Option<Vec<f32>> = None;
     let mut track = Track::with_capacity(clip.frames.len());
     for frame in &clip.frames {
-        let input = RetargetInput { frame: frame.clone(), refine, previous: previous.take() };
-        let output = retargeter.retarget(std::slice::from_ref(&input))?.swap_remove(0);
+        let input = RetargetInput {
+            frame: frame.clone(),
+            refine,
+            previous: previous.take(),
+        };
+        let output = retargeter
+            .retarget(std::slice::from_ref(&input))?
+            .swap_remove(0);
         let mut angles = output.angles;
         if refine {
             previous = Some(angles.clone());
@@ -137,10 +160,17 @@ fn answers(retargeter: &Retargeter, clip: &Clip, refine: bool, smooth: bool) -> 
 ///
 /// # Errors
 /// When there is no clip, a frame cannot be retargeted, or the simulator cannot be set up.
-pub fn report(retargeter: &Retargeter, clips: &[Clip], mut progress: impl FnMut(&str)) -> Result<Report> {
+pub fn report(
+    retargeter: &Retargeter,
+    clips: &[Clip],
+    mut progress: impl FnMut(&str),
+) -> Result<Report> {
     let frames: usize = clips.iter().map(|clip| clip.frames.len()).sum();
     ensure!(frames > 0, "expected at least one frame of motion");
-    let targets: Vec<Target> = clips.iter().flat_map(|clip| clip.frames.iter().map(Target::new)).collect();
+    let targets: Vec<Target> = clips
+        .iter()
+        .flat_map(|clip| clip.frames.iter().map(Target::new))
+        .collect();
     let indices = codes(retargeter, &targets)?;
     let mut used = indices.clone();
     used.sort_unstable();
@@ -152,12 +182,21 @@ pub fn report(retargeter: &Retargeter, clips: &[Clip], mut progress: impl FnMut(
     for method in METHODS {
         progress(method.name);
         let start = Instant::now();
-        let tracks = clips.iter().map(|clip| (method.run)(retargeter, clip)).collect::<Result<Vec<_>>>()?;
+        let tracks = clips
+            .iter()
+            .map(|clip| (method.run)(retargeter, clip))
+            .collect::<Result<Vec<_>>>()?;
         let seconds = start.elapsed().as_secs_f64();
         if reference.is_empty() {
             reference.clone_from(&tracks);
         }
-        let mut row = measure(method.name, retargeter.robot(), &targets, &tracks, &reference)?;
+        let mut row = measure(
+            method.name,
+            retargeter.robot(),
+            &targets,
+            &tracks,
+            &reference,
+        )?;
         row.frames_per_second = frames as f64 / seconds;
         row.jerk_ratio = row.jerk / rows.first().map_or(row.jerk, |first| first.jerk);
         rows.push(row);
@@ -167,7 +206,11 @@ pub fn report(retargeter: &Retargeter, clips: &[Clip], mut progress: impl FnMut(
         model: retargeter.metadata().version().to_owned(),
         clips: clips.len(),
         frames,
-        wrist_share: targets.iter().filter(|t| t.wrists.iter().any(Option::is_some)).count() as f64 / frames as f64,
+        wrist_share: targets
+            .iter()
+            .filter(|t| t.wrists.iter().any(Option::is_some))
+            .count() as f64
+            / frames as f64,
         codebook_perplexity: perplexity(&indices, codes),
         codes_used: [used.len(), codes],
         rows,
@@ -198,7 +241,13 @@ fn measure(
             solver.bone_errors(target, angles).map(f64::to_degrees);
         upper_arms.extend([left_upper, right_upper]);
         forearms.extend([left_fore, right_fore]);
-        wrists.extend(solver.wrist_errors(target, angles).into_iter().flatten().map(f64::to_degrees));
+        wrists.extend(
+            solver
+                .wrist_errors(target, angles)
+                .into_iter()
+                .flatten()
+                .map(f64::to_degrees),
+        );
         let stands = |(angle, joint): (&f64, &emp_robot::Joint)| {
             *angle <= joint.range[0] + AT_LIMIT || *angle >= joint.range[1] - AT_LIMIT
         };
@@ -234,7 +283,11 @@ fn measure(
 /// Largest change of a joint between two frames, and by frame whether it is a jump.
 fn changes(track: &Track) -> Vec<f64> {
     let change = |pair: &[Vec<f64>]| {
-        pair[0].iter().zip(&pair[1]).map(|(a, b)| (b - a).abs()).fold(0.0, f64::max)
+        pair[0]
+            .iter()
+            .zip(&pair[1])
+            .map(|(a, b)| (b - a).abs())
+            .fold(0.0, f64::max)
     };
     track.windows(2).map(change).collect()
 }
@@ -263,8 +316,12 @@ fn jerk(tracks: &[Track], rate: f64) -> f64 {
     let mut sum = 0.0;
     let mut count = 0;
     for window in tracks.iter().flat_map(|track| track.windows(4)) {
-        let third = |j: usize| window[3][j] - 3.0 * window[2][j] + 3.0 * window[1][j] - window[0][j];
-        sum += (0..window[0].len()).map(|j| third(j).powi(2)).sum::<f64>().sqrt();
+        let third =
+            |j: usize| window[3][j] - 3.0 * window[2][j] + 3.0 * window[1][j] - window[0][j];
+        sum += (0..window[0].len())
+            .map(|j| third(j).powi(2))
+            .sum::<f64>()
+            .sqrt();
         count += 1;
     }
     sum / f64::from(count.max(1)) * rate.powi(3)
@@ -286,7 +343,10 @@ impl std::fmt::Display for Report {
             "codebook perplexity {:.0}, {} of {} codes in use\n",
             self.codebook_perplexity, self.codes_used[0], self.codes_used[1]
         )?;
-        writeln!(f, "| method | direction ° mean / p95 | upper arm ° | forearm ° | wrist ° | at a limit | largest jump rad | jumps (own) | jerk / reference | self-collision | frames/s |")?;
+        writeln!(
+            f,
+            "| method | direction ° mean / p95 | upper arm ° | forearm ° | wrist ° | at a limit | largest jump rad | jumps (own) | jerk / reference | self-collision | frames/s |"
+        )?;
         writeln!(f, "|---|---|---|---|---|---|---|---|---|---|---|")?;
         for row in &self.rows {
             let spread = |s: &Spread| format!("{:.2} / {:.2}", s.mean, s.p95);

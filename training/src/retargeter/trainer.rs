@@ -86,7 +86,15 @@ impl Trainer {
         let adam = Adam::new(&vars, AdamConfig::default())?;
         let loss = Loss::new(&robot)?;
         let usage = vec![0.0; network.codes()];
-        let mut trainer = Self { robot, settings, network, vars, adam, loss, usage };
+        let mut trainer = Self {
+            robot,
+            settings,
+            network,
+            vars,
+            adam,
+            loss,
+            usage,
+        };
         trainer.network.refresh_codebook()?;
         Ok(trainer)
     }
@@ -108,9 +116,13 @@ impl Trainer {
         );
         let mut trainer = Self::new(robot, settings)?;
         let tensors = tensors.into_iter().collect();
-        trainer.set_vars(&tensors).with_context(|| format!("{}", path.display()))?;
+        trainer
+            .set_vars(&tensors)
+            .with_context(|| format!("{}", path.display()))?;
         trainer.adam.restore(&tensors, saved.step)?;
-        let Some(usage) = tensors.get("usage") else { bail!("{}: no tensor `usage`", path.display()) };
+        let Some(usage) = tensors.get("usage") else {
+            bail!("{}: no tensor `usage`", path.display())
+        };
         trainer.usage = usage.to_vec1()?;
         trainer.network.refresh_codebook()?;
         Ok(trainer)
@@ -126,8 +138,15 @@ impl Trainer {
     /// # Errors
     /// When the variables' lock is poisoned.
     pub fn weights(&self) -> Result<Tensors> {
-        let vars = self.vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
-        Ok(vars.iter().map(|(name, var)| (name.clone(), var.as_detached_tensor())).collect())
+        let vars = self
+            .vars
+            .data()
+            .lock()
+            .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        Ok(vars
+            .iter()
+            .map(|(name, var)| (name.clone(), var.as_detached_tensor()))
+            .collect())
     }
 
     /// The network as it is now.
@@ -136,10 +155,17 @@ impl Trainer {
     }
 
     fn set_vars(&self, tensors: &std::collections::HashMap<String, Tensor>) -> Result<()> {
-        let vars = self.vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        let vars = self
+            .vars
+            .data()
+            .lock()
+            .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
         for (name, var) in vars.iter() {
-            let tensor = tensors.get(name).with_context(|| format!("no tensor `{name}`"))?;
-            var.set(tensor).with_context(|| format!("tensor `{name}`"))?;
+            let tensor = tensors
+                .get(name)
+                .with_context(|| format!("no tensor `{name}`"))?;
+            var.set(tensor)
+                .with_context(|| format!("tensor `{name}`"))?;
         }
         Ok(())
     }
@@ -151,11 +177,16 @@ impl Trainer {
     pub fn save_run(&self, path: &Path) -> Result<()> {
         let mut tensors = self.weights()?;
         tensors.extend(self.adam.state()?);
-        tensors.insert("usage".to_owned(), Tensor::new(self.usage.as_slice(), &Device::Cpu)?);
+        tensors.insert(
+            "usage".to_owned(),
+            Tensor::new(self.usage.as_slice(), &Device::Cpu)?,
+        );
         let mut metadata = CheckpointMetadata::for_goal_joints(RUN_KIND, &self.robot);
         metadata.config = serde_json::to_value(NetworkConfig::default())?;
-        metadata.training =
-            serde_json::to_value(Progress { settings: self.settings.clone(), step: self.steps() })?;
+        metadata.training = serde_json::to_value(Progress {
+            settings: self.settings.clone(),
+            step: self.steps(),
+        })?;
         checkpoint::save(path, metadata, &tensors)?;
         Ok(())
     }
@@ -175,7 +206,11 @@ impl Trainer {
             "recorded_motion": data,
         });
         let half = |(name, tensor): (String, Tensor)| Ok((name, tensor.to_dtype(DType::F16)?));
-        let tensors = self.weights()?.into_iter().map(half).collect::<Result<Tensors>>()?;
+        let tensors = self
+            .weights()?
+            .into_iter()
+            .map(half)
+            .collect::<Result<Tensors>>()?;
         Ok(checkpoint::save(path, metadata, &tensors)?)
     }
 
@@ -183,14 +218,18 @@ impl Trainer {
     fn step(&mut self, dataset: &Dataset) -> Result<Step> {
         let step = self.steps();
         let mut rng = step_rng(self.settings.seed, step);
-        let targets: Vec<Target> = (0..self.settings.batch).map(|_| dataset.sample(&mut rng)).collect();
+        let targets: Vec<Target> = (0..self.settings.batch)
+            .map(|_| dataset.sample(&mut rng))
+            .collect();
         let decoded = self.forward(&targets)?;
         if step == 0 {
             self.replace_codes(&decoded.latent, |_| true, &mut rng)?;
         }
         let terms = self.loss.terms(&decoded, &TargetBatch::new(&targets)?)?;
         let total = terms.total()?;
-        let gradient_norm = self.adam.step(&total.backward()?, self.learning_rate(step))?;
+        let gradient_norm = self
+            .adam
+            .step(&total.backward()?, self.learning_rate(step))?;
         for index in &decoded.indices {
             self.usage[*index as usize] += 1.0;
         }
@@ -213,24 +252,40 @@ impl Trainer {
         for target in targets {
             target.write_features(&mut features);
         }
-        let features = Tensor::from_vec(features, (targets.len(), KEY_NODES, NODE_FEATURES), &Device::Cpu)?;
+        let features = Tensor::from_vec(
+            features,
+            (targets.len(), KEY_NODES, NODE_FEATURES),
+            &Device::Cpu,
+        )?;
         Ok(self.network.forward(&features)?)
     }
 
     /// Moves the codes that `dead` names onto random latent vectors of the batch, and forgets their moments.
-    fn replace_codes(&mut self, latent: &Tensor, dead: impl Fn(usize) -> bool, rng: &mut ChaCha8Rng) -> Result<()> {
-        let codes: Vec<usize> = (0..self.network.codes()).filter(|code| dead(*code)).collect();
+    fn replace_codes(
+        &mut self,
+        latent: &Tensor,
+        dead: impl Fn(usize) -> bool,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<()> {
+        let codes: Vec<usize> = (0..self.network.codes())
+            .filter(|code| dead(*code))
+            .collect();
         if codes.is_empty() {
             return Ok(());
         }
         let (rows, width) = latent.dims2()?;
         let latent = latent.flatten_all()?.to_vec1::<f32>()?;
-        let vars = self.vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        let vars = self
+            .vars
+            .data()
+            .lock()
+            .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
         let codebook = vars.get("codebook").context("no variable `codebook`")?;
         let mut values = codebook.flatten_all()?.to_vec1::<f32>()?;
         for code in &codes {
             let row = rng.random_range(0..rows);
-            values[code * width..(code + 1) * width].copy_from_slice(&latent[row * width..(row + 1) * width]);
+            values[code * width..(code + 1) * width]
+                .copy_from_slice(&latent[row * width..(row + 1) * width]);
         }
         codebook.set(&Tensor::from_vec(values, codebook.shape(), &Device::Cpu)?)?;
         drop(vars);
@@ -259,16 +314,26 @@ struct Progress {
 /// Candle draws initial weights from a generator that cannot be seeded on the CPU; they are drawn anew here, uniformly
 /// within `±1/√inputs`.
 fn initialise(vars: &VarMap, seed: u64) -> Result<()> {
-    let vars = vars.data().lock().map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+    let vars = vars
+        .data()
+        .lock()
+        .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
     let mut names: Vec<&String> = vars.keys().collect();
     names.sort();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     for name in names {
         let var = &vars[name];
-        let weight = name.strip_suffix("bias").map(|stem| format!("{stem}weight"));
-        let shape = weight.and_then(|weight| vars.get(&weight)).unwrap_or(var).dims();
+        let weight = name
+            .strip_suffix("bias")
+            .map(|stem| format!("{stem}weight"));
+        let shape = weight
+            .and_then(|weight| vars.get(&weight))
+            .unwrap_or(var)
+            .dims();
         let bound = 1.0 / (*shape.last().unwrap_or(&1) as f32).sqrt();
-        let values: Vec<f32> = (0..var.elem_count()).map(|_| rng.random_range(-bound..bound)).collect();
+        let values: Vec<f32> = (0..var.elem_count())
+            .map(|_| rng.random_range(-bound..bound))
+            .collect();
         var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu)?)?;
     }
     Ok(())
@@ -288,7 +353,10 @@ pub fn perplexity(indices: &[u32], codes: usize) -> f64 {
         counts[*index as usize] += 1;
     }
     let total = indices.len().max(1) as f64;
-    let shares = counts.iter().filter(|count| **count > 0).map(|count| *count as f64 / total);
+    let shares = counts
+        .iter()
+        .filter(|count| **count > 0)
+        .map(|count| *count as f64 / total);
     shares.map(|p| -p * p.ln()).sum::<f64>().exp()
 }
 
@@ -298,6 +366,8 @@ pub struct RunFiles {
     pub folder: PathBuf,
     /// The weights for serving.
     pub weights: PathBuf,
+    /// Time between two checkpoints.
+    pub save_every: Duration,
 }
 
 impl RunFiles {
@@ -321,7 +391,7 @@ pub enum Outcome {
     Interrupted,
 }
 
-/// Runs the trainer to its end or to an interruption, saving every two minutes.
+/// Runs the trainer to its end or to an interruption, saving now and then.
 ///
 /// # Errors
 /// When a file cannot be written, or the gradient stops being a number.
@@ -332,7 +402,6 @@ pub fn train(
     files: &RunFiles,
     interrupt: &Interrupt,
 ) -> Result<Outcome> {
-    const SAVE_EVERY: Duration = Duration::from_secs(120);
     const LOG_EVERY: u64 = 100;
     let mut columns = vec!["step", "loss"];
     columns.extend(Terms::NAMES);
@@ -348,16 +417,18 @@ pub fn train(
             return Ok(Outcome::Interrupted);
         }
         let rate = trainer.learning_rate(trainer.steps());
-        let step = trainer.step(dataset).with_context(|| format!("step {}", trainer.steps()))?;
+        let step = trainer
+            .step(dataset)
+            .with_context(|| format!("step {}", trainer.steps()))?;
         bar.set_position(trainer.steps());
-        if trainer.steps().is_multiple_of(LOG_EVERY) {
+        if trainer.steps().is_multiple_of(LOG_EVERY) || trainer.steps() == trainer.settings.steps {
             let mut row = vec![step.total];
             row.extend(step.terms);
             row.extend([step.gradient_norm, step.perplexity, rate]);
             log.row(trainer.steps(), &row)?;
             bar.set_message(format!("loss {:.2}", step.total));
         }
-        if saved.elapsed() > SAVE_EVERY {
+        if saved.elapsed() >= files.save_every {
             trainer.save_run(&files.checkpoint())?;
             saved = Instant::now();
         }

@@ -46,10 +46,14 @@ impl Figure {
         Self::with_arms(frame, false)
     }
 
-    /// A robot: with legs, and with joints that show.
+    /// A robot: with hips and legs, and with joints that show.
     pub(super) fn robot(frame: &KeyNodeFrame, legs: &[Leg; 2]) -> Self {
         let mut figure = Self::with_arms(frame, true);
         let size = shoulder_width(frame);
+        if let [Some(left), Some(right)] = [legs[0].first(), legs[1].first()] {
+            let waist = frame.position(KeyNode::Waist);
+            figure.rod(Part::Middle, &[*left, waist, *right], 0.3 * size, &[]);
+        }
         for side in Side::BOTH {
             figure.leg(&legs[side as usize], side, size);
         }
@@ -183,13 +187,16 @@ impl Shape {
     }
 }
 
-/// Index of the joint that lies farthest from the line between the leg's first and last joint.
+/// Index of the joint in the middle of the leg: the one that is farthest from both its ends.
 fn knee(leg: &Leg) -> Option<usize> {
     let joints = &leg[..leg.len().checked_sub(SOLE)?];
     let (first, last) = (joints.first()?, joints.last()?);
-    let along = (last - first).try_normalize(1e-6)?;
-    let bend = |index: &usize| (joints[*index] - first).cross(&along).norm();
-    (0..joints.len()).max_by(|a, b| bend(a).total_cmp(&bend(b)))
+    let inside = |index: &usize| {
+        (joints[*index] - first)
+            .norm()
+            .min((joints[*index] - last).norm())
+    };
+    (0..joints.len()).max_by(|a, b| inside(a).total_cmp(&inside(b)))
 }
 
 fn shoulders(frame: &KeyNodeFrame) -> [Vector3<f32>; 2] {

@@ -65,7 +65,7 @@ impl Client {
     /// One model.
     ///
     /// # Errors
-    /// When the call fails, with NOT_FOUND for an unknown name.
+    /// When the call fails, with `NOT_FOUND` for an unknown name.
     pub async fn model(&self, name: &str) -> Result<Model, ClientError> {
         let response = self
             .model_service()
@@ -80,7 +80,7 @@ impl Client {
     /// One robot.
     ///
     /// # Errors
-    /// When the call fails, with NOT_FOUND for an unknown name.
+    /// When the call fails, with `NOT_FOUND` for an unknown name.
     pub async fn robot(&self, name: &str) -> Result<Robot, ClientError> {
         let response = self
             .model_service()

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 
 /// The project's folders, and the server's binary.
 pub(crate) struct Folders {
@@ -31,6 +31,22 @@ impl Folders {
             weights: root.join("models/weights"),
             server,
         })
+    }
+
+    /// A robot's folder.
+    pub(crate) fn robot(&self, name: &str) -> Result<PathBuf> {
+        let folders = emp_robot::robot_folders(&self.robots)?;
+        let names: Vec<_> = folders
+            .iter()
+            .filter_map(|folder| folder.file_name())
+            .collect();
+        match names.iter().position(|known| *known == name) {
+            Some(index) => Ok(folders[index].clone()),
+            None => bail!(
+                "there is no robot {name:?} in {}; there are {names:?}",
+                self.robots.display()
+            ),
+        }
     }
 }
 

@@ -62,7 +62,7 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<()> {
     let folders = Folders::find()?;
-    let robot = Robot::load(&folders.robots.join(&options.robot))?;
+    let robot = Robot::load(&folders.robot(&options.robot)?)?;
     let motion = Motion::load(options.motion.as_deref(), robot.control_rate_hz())?;
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot make {}", options.out.display()))?;

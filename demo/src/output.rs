@@ -29,7 +29,7 @@ pub(crate) fn robot_pose(
     wrists: &[Matrix3<f64>; 2],
 ) -> KeyNodeFrame {
     KeyNodeFrame {
-        positions: positions.map(|position| position.cast()),
+        positions: positions.map(Vector3::cast),
         wrist_rotations: wrists.map(|wrist| Some(Rotation3::from_matrix_unchecked(wrist.cast()))),
     }
 }
@@ -54,7 +54,7 @@ pub(crate) fn contact_sheet(
             legs: frame
                 .legs
                 .clone()
-                .map(|leg| leg.iter().map(|point| point.cast()).collect()),
+                .map(|leg| leg.into_iter().map(Vector3::cast).collect()),
         }
     };
     let moments: Vec<Moment> = differing(&motion.clip.frames, MOMENTS)

@@ -243,7 +243,7 @@ impl View {
             for (edge, color) in [(EDGE, PANEL), (0.0, shape.color)] {
                 match &shape.kind {
                     Kind::Rod { width, .. } => {
-                        canvas.line(&points, width * scale + 2.0 * edge, color)
+                        canvas.line(&points, width * scale + 2.0 * edge, color);
                     }
                     Kind::Slab { rounding } => canvas.area(&points, rounding * scale + edge, color),
                     Kind::Ball { radius } => canvas.disc(points[0], radius * scale + edge, color),

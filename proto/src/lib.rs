@@ -6,8 +6,7 @@
 #![forbid(unsafe_code)]
 
 /// The encoded `FileDescriptorSet` of the package and its imports, comments included: what reflection serves.
-pub const FILE_DESCRIPTOR_SET: &[u8] =
-    include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Package `emp.v1`.
 #[allow(
@@ -22,7 +21,7 @@ pub mod v1 {
 #[cfg(test)]
 mod tests {
     use prost::Message as _;
-    use prost_types::FileDescriptorSet;
+    use prost_types::{FileDescriptorSet, ServiceDescriptorProto};
 
     use super::*;
 
@@ -33,7 +32,7 @@ mod tests {
             .file
             .iter()
             .filter(|file| file.package() == "emp.v1")
-            .flat_map(|file| file.service.iter().map(|service| service.name()))
+            .flat_map(|file| file.service.iter().map(ServiceDescriptorProto::name))
             .collect();
         assert_eq!(services, ["ModelService", "MotionService"]);
 
@@ -48,6 +47,10 @@ mod tests {
             .flat_map(|info| &info.location)
             .filter_map(|location| location.leading_comments.as_deref())
             .collect();
-        assert!(comments.iter().any(|text| text.contains("Centre of the left elbow; metres")));
+        assert!(
+            comments
+                .iter()
+                .any(|text| text.contains("Centre of the left elbow; metres"))
+        );
     }
 }

@@ -296,7 +296,7 @@ impl Session {
                     ticket,
                     header,
                     deadline,
-                })
+                });
             }
             Err(Rejected::Full(_)) => {
                 self.drop_frame(header, DropReason::Overloaded, "the model's queue is full");

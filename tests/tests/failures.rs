@@ -305,7 +305,7 @@ async fn a_server_that_stays_away_is_an_error() -> anyhow::Result<()> {
     })
     .await?;
     assert!(matches!(error, ClientError::Lost { .. }), "{error}");
-    let error = Client::connect(&url).await.err().expect("nobody there");
+    let error = Client::connect(&url).await.expect_err("nobody there");
     assert!(error.to_string().contains(&url), "{error}");
     Ok(())
 }

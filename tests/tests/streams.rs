@@ -188,7 +188,7 @@ async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyh
     for delivery in [Delivery::All, Delivery::Latest] {
         let mut stream = started(&client, delivery).await?;
         for (number, (pose, wrong)) in (0..).zip(&frames) {
-            stream.send(raw::frame(number, pose.clone())).await;
+            stream.send(raw::frame(number, *pose)).await;
             // One at a time, so that `LATEST` supersedes nothing.
             match (within("an answer", stream.next()).await??, wrong) {
                 (Some(Message::Result(answered)), None) => {
@@ -209,7 +209,7 @@ async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyh
     // Sent at once, `ALL` keeps even the notices in order.
     let mut stream = started(&client, Delivery::All).await?;
     for (number, (pose, _)) in (0..).zip(&frames) {
-        stream.send(raw::frame(number, pose.clone())).await;
+        stream.send(raw::frame(number, *pose)).await;
     }
     stream.finish();
     let mut numbers = Vec::new();
@@ -359,8 +359,7 @@ async fn a_cancelled_stream_gives_its_place_back_and_costs_no_more() -> anyhow::
     let refused = client
         .stream(StreamConfig::for_robot("emp27"))
         .await
-        .err()
-        .expect("no place");
+        .expect_err("no place");
     assert_eq!(refused.code(), Some(Code::ResourceExhausted));
     assert_eq!(refused.reason().as_deref(), Some("OVERLOADED"));
     drop((sender, events));

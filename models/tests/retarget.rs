@@ -1,5 +1,7 @@
 //! The retargeting path on real robots: gradients, the solver, the network's promises, checkpoints.
 
+#![allow(clippy::unwrap_used, reason = "a helper that fails must fail its test")]
+
 use std::{path::Path, sync::Arc};
 
 use candle_core::{DType, Device, Tensor, Var};
@@ -16,7 +18,7 @@ use emp_models::{
 use emp_motion::{Clip, KEY_NODES, skills};
 use emp_robot::Robot;
 use proptest::prelude::*;
-use rand::{RngExt as _, SeedableRng as _};
+use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 
 fn root() -> &'static Path {

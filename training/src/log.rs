@@ -28,7 +28,7 @@ impl CsvLog {
         for row in &kept {
             text.write_record(row)?;
         }
-        let bytes = text.into_inner().map_err(|e| e.into_error())?;
+        let bytes = text.into_inner().map_err(csv::IntoInnerError::into_error)?;
         write_atomically(path, &bytes).with_context(|| format!("writing {}", path.display()))?;
         let file = OpenOptions::new()
             .append(true)

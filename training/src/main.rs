@@ -212,7 +212,7 @@ fn report_retargeter(arguments: &ReportArguments) -> Result<ExitCode> {
     };
     let bar = run::spinner();
     let report = report::report(&retargeter, &clips, |method| {
-        bar.set_message(method.to_owned())
+        bar.set_message(method.to_owned());
     })?;
     bar.finish_and_clear();
     let json = serde_json::to_string_pretty(&report)?;

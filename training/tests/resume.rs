@@ -1,5 +1,7 @@
 //! A run that is killed and resumed makes the same weights as one that is left alone.
 
+#![allow(clippy::unwrap_used, reason = "a helper that fails must fail its test")]
+
 use std::{
     path::Path,
     process::{Command, Stdio},

@@ -49,7 +49,7 @@ impl Target {
         ];
         let line: Vector2<f64> = frame.shoulder_line().xy().cast();
         Self {
-            bones: bones.map(|bone| bone.cast()),
+            bones: bones.map(Vector3::cast),
             // A trunk that lies on its side shows no yaw from above.
             shoulder_line: line.try_normalize(1e-3).unwrap_or_else(Vector2::y),
             wrists: frame

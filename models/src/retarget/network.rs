@@ -336,9 +336,9 @@ fn index_of_max(row: &[f32]) -> u32 {
 pub struct Decoded {
     /// Joint angles in goal order, batch × joints, radians, inside the joints' limits.
     pub angles: Tensor,
-    /// Latent features before rounding, z_B: (batch · joints) × width.
+    /// Latent features before rounding, `z_B`: (batch · joints) × width.
     pub latent: Tensor,
-    /// The codes chosen, e_k: (batch · joints) × width.
+    /// The codes chosen, `e_k`: (batch · joints) × width.
     pub codes: Tensor,
     /// The codes' indices.
     pub indices: Vec<u32>,
@@ -353,7 +353,7 @@ pub struct RetargetNetwork {
     decoder: Vec<GraphLayer>,
     human: Tree,
     robot: Tree,
-    /// 1 × joints × 6: origin and orientation of each joint in its parent's frame (E_B).
+    /// 1 × joints × 6: origin and orientation of each joint in its parent's frame (`E_B`).
     robot_edges: Tensor,
     /// 1 × joints × 2: lower and upper limit, radians.
     limits: Tensor,
@@ -430,7 +430,7 @@ impl RetargetNetwork {
         self.codebook.half_norms.len()
     }
 
-    /// Human nodes to latent features of the robot's joints, z_B = tanh(f_tf(f_e(Q_A, E_A))): (batch · joints) × width.
+    /// Human nodes to latent features of the robot's joints, `z_B = tanh(f_tf(f_e(Q_A, E_A)))`: (batch · joints) × width.
     ///
     /// # Errors
     /// When `features` is not batch × key nodes × [`NODE_FEATURES`].
@@ -448,7 +448,7 @@ impl RetargetNetwork {
             .reshape(((), width))
     }
 
-    /// Edge features of the human graph, E_A: each node's offset from its parent, batch × nodes × 3.
+    /// Edge features of the human graph, `E_A`: each node's offset from its parent, batch × nodes × 3.
     fn bones(&self, positions: &Tensor) -> candle_core::Result<Tensor> {
         let parents = self
             .human
@@ -460,7 +460,7 @@ impl RetargetNetwork {
         positions - positions.index_select(&parents, 1)?
     }
 
-    /// Codes to joint angles, f_d(z_e, E_B): batch × joints, radians.
+    /// Codes to joint angles, `f_d(z_e, E_B)`: batch × joints, radians.
     ///
     /// # Errors
     /// When `codes` is not (batch · joints) × code width.

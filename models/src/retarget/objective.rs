@@ -6,7 +6,7 @@
 
 use emp_motion::KeyNode;
 use emp_robot::{FrameKinematics, Robot};
-use nalgebra::Vector3;
+use nalgebra::{DMatrix, DVector, Vector3};
 
 use super::{
     angle_between,
@@ -65,22 +65,17 @@ impl Effort {
 
 /// Normal equations `(JᵀJ + μ I) δ = −Jᵀ r` over the goal joints.
 struct Normal {
-    size: usize,
-    matrix: Vec<f64>,
-    gradient: Vec<f64>,
-    factor: Vec<f64>,
-    step: Vec<f64>,
+    /// `JᵀJ`; only the lower triangle is kept.
+    matrix: DMatrix<f64>,
+    /// `Jᵀ r`.
+    gradient: DVector<f64>,
 }
 
 impl Normal {
-    fn new(size: usize) -> Self {
-        let vector = vec![0.0; size];
+    fn new(joints: usize) -> Self {
         Self {
-            size,
-            matrix: vec![0.0; size * size],
-            gradient: vector.clone(),
-            factor: vec![0.0; size * size],
-            step: vector,
+            matrix: DMatrix::zeros(joints, joints),
+            gradient: DVector::zeros(joints),
         }
     }
 
@@ -89,56 +84,34 @@ impl Normal {
         self.gradient.fill(0.0);
     }
 
-    /// Adds a three-dimensional residual and its derivatives by the given joints; only the lower triangle is kept.
+    /// Adds a three-dimensional residual and its derivatives by the given joints.
     fn add(&mut self, residual: &Vector3<f64>, derivatives: &[(usize, Vector3<f64>)]) {
         for (i, a) in derivatives {
             self.gradient[*i] += a.dot(residual);
             for (j, b) in derivatives {
                 if j <= i {
-                    self.matrix[i * self.size + j] += a.dot(b);
+                    self.matrix[(*i, *j)] += a.dot(b);
                 }
             }
         }
     }
 
-    /// Solves for the joints that `free` names by Cholesky's method; the others stay. False where the damped matrix is
-    /// not positive definite.
-    fn solve(&mut self, damping: f64, free: &[bool]) -> bool {
-        let n = self.size;
-        for i in 0..n {
-            for j in 0..=i {
-                let mut sum = match (free[i] && free[j], i == j) {
-                    (true, true) => self.matrix[i * n + i] + damping,
-                    (true, false) => self.matrix[i * n + j],
-                    (false, diagonal) => f64::from(u8::from(diagonal)),
-                };
-                for k in 0..j {
-                    sum -= self.factor[i * n + k] * self.factor[j * n + k];
-                }
-                self.factor[i * n + j] = if i != j {
-                    sum / self.factor[j * n + j]
-                } else if sum > 0.0 {
-                    sum.sqrt()
-                } else {
-                    return false;
-                };
+    /// The step for the joints that `free` names, zero for the others; nothing where the damped matrix is not positive
+    /// definite.
+    fn solve(&self, damping: f64, free: impl Fn(usize) -> bool) -> Option<DVector<f64>> {
+        let mut matrix = self.matrix.clone();
+        let mut step = -&self.gradient;
+        for i in 0..step.len() {
+            matrix[(i, i)] += damping;
+            if !free(i) {
+                matrix.row_mut(i).fill(0.0);
+                matrix.column_mut(i).fill(0.0);
+                matrix[(i, i)] = 1.0;
+                step[i] = 0.0;
             }
         }
-        for i in 0..n {
-            let mut sum = if free[i] { -self.gradient[i] } else { 0.0 };
-            for k in 0..i {
-                sum -= self.factor[i * n + k] * self.step[k];
-            }
-            self.step[i] = sum / self.factor[i * n + i];
-        }
-        for i in (0..n).rev() {
-            let mut sum = self.step[i];
-            for k in i + 1..n {
-                sum -= self.factor[k * n + i] * self.step[k];
-            }
-            self.step[i] = sum / self.factor[i * n + i];
-        }
-        true
+        matrix.cholesky()?.solve_mut(&mut step);
+        Some(step)
     }
 }
 
@@ -172,7 +145,7 @@ impl<'a> Solver<'a> {
         self.frame.update(angles);
         let mut sum = 0.0;
         self.terms().visit(target, angles, |residual, _, _| {
-            sum += residual.norm_squared()
+            sum += residual.norm_squared();
         });
         sum
     }
@@ -191,8 +164,9 @@ impl<'a> Solver<'a> {
         self.frame.update(angles);
         std::array::from_fn(|side| {
             let wanted = target.wrists[side]?;
-            let difference = wanted.transpose() * self.frame.wrist_rotations()[side];
-            Some(((difference.trace() - 1.0) / 2.0).clamp(-1.0, 1.0).acos())
+            let distance = (wanted - self.frame.wrist_rotations()[side]).norm();
+            // ‖R − R̂‖² = 8 sin²(θ/2): exact near 0, where a trace's arc cosine is not.
+            Some(2.0 * (distance / 8f64.sqrt()).min(1.0).asin())
         })
     }
 
@@ -237,23 +211,16 @@ impl<'a> Solver<'a> {
     fn step(&mut self, angles: &[f64], damping: f64) {
         let joints = self.robot.goal_joints();
         let gradient = &self.normal.gradient;
-        let free: Vec<bool> = angles
-            .iter()
-            .zip(joints)
-            .zip(gradient)
-            .map(|((angle, joint), slope)| {
-                let [lower, upper] = joint.range;
-                !(*angle <= lower && *slope > 0.0 || *angle >= upper && *slope < 0.0)
-            })
-            .collect();
-        let solved = self.normal.solve(damping, &free);
-        for (i, (trial, joint)) in self.trial.iter_mut().zip(joints).enumerate() {
-            let step = if solved && free[i] {
-                self.normal.step[i]
-            } else {
-                0.0
-            };
-            *trial = (angles[i] + step).clamp(joint.range[0], joint.range[1]);
+        let free = |i: usize| {
+            let [lower, upper] = joints[i].range;
+            !(angles[i] <= lower && gradient[i] > 0.0 || angles[i] >= upper && gradient[i] < 0.0)
+        };
+        self.trial.copy_from_slice(angles);
+        let Some(step) = self.normal.solve(damping, free) else {
+            return;
+        };
+        for ((trial, joint), step) in self.trial.iter_mut().zip(joints).zip(&step) {
+            *trial = (*trial + step).clamp(joint.range[0], joint.range[1]);
         }
     }
 

@@ -123,7 +123,14 @@ fn documentation(workspace: &Workspace) -> Result<()> {
 }
 
 fn deny(workspace: &Workspace, tools: &Tools) -> Result<()> {
-    let check = ["--workspace", "check", "bans", "licenses", "sources"];
+    let check = [
+        "--workspace",
+        "check",
+        "--hide-inclusion-graph",
+        "bans",
+        "licenses",
+        "sources",
+    ];
     workspace.run(workspace.command(tools.program("cargo-deny")).args(check))
 }
 

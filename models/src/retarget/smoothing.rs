@@ -2,11 +2,19 @@
 
 /// A three-tap binomial filter, `¼ x_t + ½ x_{t−1} + ¼ x_{t−2}`: a delay of exactly one frame at every frequency, and
 /// nothing left of what alternates from frame to frame, which is what a jump between codes looks like.
+///
+/// No joint then moves by more than [`LARGEST_STEP`] in a frame: where a pose has two answers and the human passes from
+/// one to the other, the robot takes a few frames to follow.
 #[derive(Clone, Debug, Default)]
 pub struct Smoother {
-    /// x_{t−1} and x_{t−2}; empty before the first frame.
+    /// `x_{t−1}` and `x_{t−2}`; empty before the first frame.
     previous: [Vec<f32>; 2],
+    /// The last answer.
+    answer: Vec<f32>,
 }
+
+/// Largest change of a joint between two answers, radians: 12 rad/s at 50 Hz, about the speed of a punch.
+pub const LARGEST_STEP: f32 = 0.24;
 
 impl Smoother {
     /// A smoother that has seen nothing: its first answer is its first input.
@@ -22,11 +30,14 @@ impl Smoother {
         if one.len() != angles.len() {
             *one = angles.to_vec();
             two.clone_from(one);
+            self.answer.clone_from(one);
         }
-        for ((x, one), two) in angles.iter_mut().zip(one).zip(two) {
+        let past = one.iter_mut().zip(two).zip(&mut self.answer);
+        for (x, ((one, two), answer)) in angles.iter_mut().zip(past) {
             let smooth = 0.25 * *x + 0.5 * *one + 0.25 * *two;
             *two = std::mem::replace(one, *x);
-            *x = smooth;
+            *answer += (smooth - *answer).clamp(-LARGEST_STEP, LARGEST_STEP);
+            *x = *answer;
         }
     }
 
@@ -63,6 +74,16 @@ mod tests {
         let out = run((0..20).map(|t| if t % 2 == 0 { 0.4 } else { 0.6 }));
         assert!(out[2..].iter().all(|y| (y - 0.5).abs() < 1e-6));
         assert!(run([0.3; 5]).iter().all(|y| (y - 0.3).abs() < 1e-7));
+    }
+
+    #[test]
+    fn a_jump_becomes_a_walk() {
+        let out = run((0..20).map(|t| if t < 5 { 0.0 } else { 2.0 }));
+        assert!(
+            out.windows(2)
+                .all(|pair| (pair[1] - pair[0]).abs() <= LARGEST_STEP + 1e-6)
+        );
+        assert!((out[19] - 2.0).abs() < 1e-6);
     }
 
     #[test]

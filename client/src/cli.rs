@@ -36,6 +36,16 @@ pub(crate) struct Arguments {
 #[derive(Subcommand)]
 pub(crate) enum Command {
     /// Retarget a motion file to a robot
+    ///
+    /// The motion is resampled to the robot's control rate and streamed. The result is a CSV table: `time_s`, then one
+    /// column a joint (radians, in the robot's goal order).
+    ///
+    /// At the end, latency percentiles, batch sizes, direction error and dropped frames are printed. With --realtime the
+    /// latency is that of a live source; without, frames are sent as fast as the server takes them, and the latency
+    /// counts how long they queue behind each other.
+    ///
+    /// A lost connection is restored with growing pauses, for up to a minute; frames without an answer are sent again
+    /// (dropped with --realtime).
     Retarget(Retarget),
     /// List the robots that the server serves
     Robots,
@@ -43,14 +53,7 @@ pub(crate) enum Command {
     Models,
 }
 
-/// Retargets a motion file to a robot.
-///
-/// The motion is resampled to the robot's control rate and streamed. The result is a CSV table: `time_s`, then one
-/// column a joint (radians, in the robot's goal order). At the end, latency percentiles, dropped frames and batch sizes
-/// are printed.
-///
-/// A lost connection is restored with growing pauses, for up to a minute; frames without an answer are sent again
-/// (dropped with --realtime).
+/// What to retarget, for whom, and how.
 #[derive(Args)]
 pub(crate) struct Retarget {
     /// Motion file: BVH (.bvh), AMASS (.npz) or key nodes (.npz)

@@ -16,7 +16,7 @@ use tonic::{Status, Streaming, transport::Channel};
 
 use crate::{
     Backoff, ClientError, DropCause, Dropped, Event, FrameSender, StreamConfig, StreamEvents,
-    backoff::is_worth_retrying, stream::Outbound, wire,
+    backoff::Break, stream::Outbound, wire,
 };
 
 /// Most frames without an answer.
@@ -34,7 +34,7 @@ pub(crate) async fn start(
     config: StreamConfig,
     backoff: Backoff,
 ) -> Result<(FrameSender, StreamEvents), ClientError> {
-    let (connection, started) = open(&service, &config).await.map_err(ClientError::Status)?;
+    let (connection, started) = open(&service, &config).await?;
     let (frames, from_program) = mpsc::channel(HAND_OVER);
     let (to_program, events) = mpsc::channel(EVENTS);
     let StreamStarted {
@@ -50,6 +50,7 @@ pub(crate) async fn start(
         frames: from_program,
         sending: true,
         events: to_program,
+        joint_names: joint_names.clone(),
         window: VecDeque::new(),
         unsent: 0,
     };
@@ -79,7 +80,7 @@ struct Connection {
 async fn open(
     service: &MotionServiceClient<Channel>,
     config: &StreamConfig,
-) -> Result<(Connection, StreamStarted), Status> {
+) -> Result<(Connection, StreamStarted), Break> {
     let (requests, outbound) = mpsc::channel(HAND_OVER);
     let first = StreamRetargetRequest {
         message: Some(Outgoing::Config(config.message())),
@@ -104,13 +105,11 @@ async fn open(
                 },
                 started,
             )),
-            _ => Err(Status::unavailable(
-                "the stream ended before it was accepted",
-            )),
+            _ => Err(Break::Silence("the stream ended before it was accepted")),
         }
     };
     timeout(OPEN_TIMEOUT, opening).await.unwrap_or_else(|_| {
-        Err(Status::unavailable(
+        Err(Break::Silence(
             "the server did not accept the stream in time",
         ))
     })
@@ -131,6 +130,8 @@ struct Driver {
     /// Whether the program may still send.
     sending: bool,
     events: mpsc::Sender<Result<Event, ClientError>>,
+    /// Names and order of the joints of every answer.
+    joint_names: Vec<String>,
     window: VecDeque<Unanswered>,
     /// Index in the window of the first frame that this connection has not seen.
     unsent: usize,
@@ -143,7 +144,7 @@ enum End {
     /// The program let go of its events.
     Abandoned,
     /// The connection or the server ended it.
-    Broken(Status),
+    Broken(Break),
     /// The stream cannot go on.
     Failed(ClientError),
 }
@@ -162,20 +163,18 @@ impl Driver {
         loop {
             let end = self.converse(connection).await;
             let end = match end {
-                End::Broken(status) if is_worth_retrying(&status) => {
-                    match self.reconnect(status).await {
-                        Ok(new) => {
-                            connection = new;
-                            continue;
-                        }
-                        Err(end) => end,
+                End::Broken(end) if end.is_worth_retrying() => match self.reconnect(end).await {
+                    Ok(new) => {
+                        connection = new;
+                        continue;
                     }
-                }
+                    Err(end) => end,
+                },
                 end => end,
             };
             let error = match end {
                 End::Finished | End::Abandoned => return,
-                End::Broken(status) => ClientError::Status(status),
+                End::Broken(end) => end.into(),
                 End::Failed(error) => error,
             };
             // Whoever let go of the events does not want to know.
@@ -215,9 +214,9 @@ impl Driver {
                     return End::Finished;
                 }
                 Step::Response(Ok(None)) => {
-                    return End::Broken(Status::unavailable("the server ended the stream early"));
+                    return End::Broken(Break::Silence("the server ended the stream early"));
                 }
-                Step::Response(Err(status)) => return End::Broken(status),
+                Step::Response(Err(status)) => return End::Broken(status.into()),
             }
         }
     }
@@ -267,12 +266,12 @@ impl Driver {
     }
 
     /// Restores the connection, or says why it cannot be.
-    async fn reconnect(&mut self, mut last: Status) -> Result<Connection, End> {
+    async fn reconnect(&mut self, mut last: Break) -> Result<Connection, End> {
         let start = Instant::now();
         self.unsent = 0;
         for attempt in 1.. {
             let retry_in = self.backoff.pause(attempt, &last);
-            let reason = last.message().to_owned();
+            let reason = last.reason().to_owned();
             if start.elapsed() + retry_in > self.backoff.give_up {
                 let seconds = start.elapsed().as_secs_f64();
                 return Err(End::Failed(ClientError::Lost {
@@ -292,6 +291,10 @@ impl Driver {
                 return Err(End::Abandoned);
             }
             match open(&self.service, &self.config).await {
+                Ok((_, started)) if started.joint_names != self.joint_names => {
+                    let what = "the server came back with other joints";
+                    return Err(End::Failed(ClientError::Contract(what)));
+                }
                 Ok((connection, _)) => {
                     let resent = self.window.len();
                     return if self.tell(Event::Reconnected { resent }).await {
@@ -300,8 +303,8 @@ impl Driver {
                         Err(End::Abandoned)
                     };
                 }
-                Err(status) if is_worth_retrying(&status) => last = status,
-                Err(status) => return Err(End::Broken(status)),
+                Err(end) if end.is_worth_retrying() => last = end,
+                Err(end) => return Err(End::Broken(end)),
             }
         }
         Err(End::Broken(last))

@@ -17,6 +17,9 @@ pub enum ClientError {
     /// The server refused or failed.
     #[error("the server answered {}: {}", code_name(.0.code()), .0.message())]
     Status(Status),
+    /// The server fell silent, or ended a stream without a reason.
+    #[error("{0}")]
+    Silence(&'static str),
     /// The connection was lost and could not be restored in time.
     #[error("connection lost and not restored within {seconds:.0} s: {last}")]
     Lost {

@@ -62,7 +62,7 @@ pub(crate) enum ServiceError {
     #[error("the server is shutting down")]
     ShuttingDown,
     /// The transport ended the call (reset by the client, message too large, not decodable): its status stands.
-    #[error("{0}")]
+    #[error("{}", .0.message())]
     Transport(Status),
 }
 

@@ -15,7 +15,8 @@ use emp_tests::{
     raw::{self, RawStream},
     within,
 };
-use tonic::{Code, transport::Channel};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Request, metadata::MetadataValue, transport::Channel};
 use tonic_types::StatusExt as _;
 
 fn fake_server(settings: Settings, gate: &Gate) -> anyhow::Result<TestServer> {
@@ -345,6 +346,24 @@ async fn a_frame_whose_budget_runs_out_is_dropped_and_the_stream_lives() -> anyh
 }
 
 #[tokio::test]
+async fn a_streams_own_deadline_ends_it() -> anyhow::Result<()> {
+    let server = fake_server(Settings::default(), &Gate::open())?;
+    let mut client = raw_client(&server).await;
+    let (requests, outbound) = tokio::sync::mpsc::channel(4);
+    requests.send(raw::config("emp27", Delivery::All)).await?;
+    let mut call = Request::new(ReceiverStream::new(outbound));
+    call.metadata_mut()
+        .insert("grpc-timeout", MetadataValue::from_static("300m"));
+    let mut responses = client.stream_retarget(call).await?.into_inner();
+    assert!(responses.message().await?.is_some(), "it starts");
+    let status = within("the deadline", responses.message())
+        .await?
+        .expect_err("late");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_cancelled_stream_gives_its_place_back_and_costs_no_more() -> anyhow::Result<()> {
     let gate = Gate::closed();
     let mut settings = Settings::default();
@@ -426,13 +445,18 @@ async fn under_overload_open_streams_lose_frames_and_new_ones_are_refused() -> a
     assert!(status.get_error_details().retry_info().is_some());
 
     gate.let_batches_pass();
-    streams[lost].send(frame()).await;
-    for stream in &mut streams {
+    // Once the others are answered there is room again.
+    for index in [0, 3 - lost] {
         assert!(matches!(
-            within("an answer", stream.next()).await??,
+            within("an answer", streams[index].next()).await??,
             Some(Message::Result(_))
         ));
     }
+    streams[lost].send(frame()).await;
+    assert!(matches!(
+        within("an answer", streams[lost].next()).await??,
+        Some(Message::Result(_))
+    ));
     Ok(())
 }
 

@@ -90,6 +90,11 @@ async fn real_weights_answer_as_in_process_and_batches_as_single() -> anyhow::Re
             assert!((answer.direction_error - alone.direction_error).abs() <= DIRECTION_TOLERANCE);
             largest_batch = largest_batch.max(answer.batch_size);
         }
+        let allowed = if refine { 0 } else { CODE_TIES };
+        assert!(
+            differing <= allowed,
+            "{differing} of 64 answers differ, refine {refine}"
+        );
         assert!(largest_batch > 1, "64 calls at once never met in a batch");
     }
     Ok(())

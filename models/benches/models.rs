@@ -74,13 +74,10 @@ impl Mlps {
         })
     }
 
+    /// The layers alone: activations are the same ops on either side.
     fn forward(&self, state: &Tensor, goal: &Tensor) -> candle_core::Result<Tensor> {
         let run = |mlp: &[Layer], x: &Tensor| {
-            let last = mlp.len() - 1;
-            mlp.iter().enumerate().try_fold(x.clone(), |x, (i, layer)| {
-                let y = layer.forward(&x)?;
-                if i < last { y.elu(1.0) } else { Ok(y) }
-            })
+            mlp.iter().try_fold(x.clone(), |x, layer| layer.forward(&x))
         };
         let latent = Tensor::cat(
             &[run(&self.mlps[0], state)?, run(&self.mlps[1], goal)?],
@@ -101,7 +98,6 @@ fn linear_op(c: &mut Criterion) {
             let goal = Tensor::randn(0f32, 1.0, (batch, 15), &Device::Cpu).expect("a tensor");
             for (name, network) in &networks {
                 let network = network.as_ref().expect("the network");
-                // Weights without a graph, as in serving.
                 group.bench_function(BenchmarkId::new(*name, batch), |b| {
                     b.iter(|| black_box(network.forward(&state, &goal).expect("forward")));
                 });

@@ -170,9 +170,9 @@ pub fn load(path: &Path) -> Result<(CheckpointMetadata, Tensors), ModelError> {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, ModelError> {
-    let io = |source| ModelError::Io {
+    let io = |reason| ModelError::Io {
         path: path.to_owned(),
-        source,
+        reason,
     };
     let size = std::fs::metadata(path).map_err(io)?.len();
     if size > MAX_BYTES {
@@ -200,9 +200,9 @@ pub fn save(
     let json = serde_json::to_string(&metadata).map_err(candle_core::Error::wrap)?;
     let header = HashMap::from([(METADATA_KEY.to_owned(), json)]);
     let bytes = safetensors::serialize(tensors, Some(header)).map_err(candle_core::Error::from)?;
-    write_atomically(path, &bytes).map_err(|source| ModelError::Io {
+    write_atomically(path, &bytes).map_err(|reason| ModelError::Io {
         path: path.to_owned(),
-        source,
+        reason,
     })?;
     Ok(metadata)
 }

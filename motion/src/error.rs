@@ -52,12 +52,12 @@ impl FrameError {
 #[derive(Debug, thiserror::Error)]
 pub enum MotionError {
     /// The operating system refused.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {reason}", path.display())]
     Io {
         /// The file or folder.
         path: PathBuf,
         /// The system's reason.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// A text file is wrong at one line.
     #[error("{}:{line}: {reason}", path.display())]
@@ -78,14 +78,14 @@ pub enum MotionError {
         reason: String,
     },
     /// One frame of a file does not describe a body.
-    #[error("{}: frame {frame}: {source}", path.display())]
+    #[error("{}: frame {frame}: {reason}", path.display())]
     Frame {
         /// The file.
         path: PathBuf,
         /// The frame, counted from 0.
         frame: usize,
         /// What is wrong with it.
-        source: FrameError,
+        reason: FrameError,
     },
 }
 
@@ -105,10 +105,10 @@ impl MotionError {
         }
     }
 
-    pub(crate) fn io(path: &Path, source: std::io::Error) -> Self {
+    pub(crate) fn io(path: &Path, reason: std::io::Error) -> Self {
         Self::Io {
             path: path.to_owned(),
-            source,
+            reason,
         }
     }
 }

@@ -112,10 +112,10 @@ pub(crate) fn into_clip(
 pub(crate) fn validated(path: &Path, clip: Clip) -> Result<Clip, MotionError> {
     match clip.validate() {
         Ok(()) => Ok(clip),
-        Err((frame, source)) => Err(MotionError::Frame {
+        Err((frame, reason)) => Err(MotionError::Frame {
             path: path.to_owned(),
             frame,
-            source,
+            reason,
         }),
     }
 }

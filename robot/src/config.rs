@@ -173,9 +173,9 @@ pub(crate) struct FootConfig {
 impl Config {
     /// Reads `file` and checks every value that can be judged without the model.
     pub(crate) fn load(file: &Path) -> Result<Self, RobotError> {
-        let text = std::fs::read_to_string(file).map_err(|source| RobotError::Read {
+        let text = std::fs::read_to_string(file).map_err(|reason| RobotError::Read {
             file: file.to_path_buf(),
-            source,
+            reason,
         })?;
         let config = Self::parse(file, &text)?;
         Checks { file }.config(&config)?;

@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
     /// A file or folder could not be read.
-    #[error("{}: cannot be read: {source}", file.display())]
+    #[error("{}: cannot be read: {reason}", file.display())]
     Read {
         /// The file or folder.
         file: PathBuf,
         /// What the system said.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// `robot.toml` is not TOML, or a key is unknown, missing or of the wrong type.
     #[error("{}: {key}: {message}", file.display())]

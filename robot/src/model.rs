@@ -68,9 +68,9 @@ fn open(files: &Files<'_>, config: &Config) -> Result<MjSpec, RobotError> {
 
 /// Refuses what MuJoCo would let through: bytes that are no text, and NaN, which it takes for "not given".
 fn check_text(files: &Files<'_>) -> Result<(), RobotError> {
-    let text = std::fs::read_to_string(files.model).map_err(|source| RobotError::Read {
+    let text = std::fs::read_to_string(files.model).map_err(|reason| RobotError::Read {
         file: files.model.to_path_buf(),
-        source,
+        reason,
     })?;
     let is_nan = |word: &str| word.eq_ignore_ascii_case("nan");
     let in_word = |c: char| c.is_alphanumeric() || c == '_' || c == '-';

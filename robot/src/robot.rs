@@ -350,9 +350,9 @@ impl Robot {
 /// # Errors
 /// If the folder cannot be read.
 pub fn robot_folders(dir: &Path) -> Result<Vec<PathBuf>, RobotError> {
-    let read = |source| RobotError::Read {
+    let read = |reason| RobotError::Read {
         file: dir.to_path_buf(),
-        source,
+        reason,
     };
     let mut folders = Vec::new();
     for entry in std::fs::read_dir(dir).map_err(read)? {

@@ -59,12 +59,12 @@ pub enum CatalogError {
         weights: PathBuf,
     },
     /// A model cannot be built.
-    #[error("model {name}: {source}")]
+    #[error("model {name}: {reason}")]
     Model {
         /// The model's name.
         name: String,
         /// The reason.
-        source: BackendError,
+        reason: BackendError,
     },
 }
 
@@ -108,7 +108,7 @@ impl Catalog {
         let loaded =
             Retargeter::load(weights, Arc::clone(robot)).map_err(|error| CatalogError::Model {
                 name: name.clone(),
-                source: BackendError::new(error.to_string()),
+                reason: BackendError::new(error.to_string()),
             })?;
         let card = wire::model_card(name, loaded.metadata());
         let mut first = Some(loaded);
@@ -136,9 +136,9 @@ impl Catalog {
             queue: batching.queue.get(),
         };
         let batcher =
-            Batcher::start(&card.name, limits, build).map_err(|source| CatalogError::Model {
+            Batcher::start(&card.name, limits, build).map_err(|reason| CatalogError::Model {
                 name: card.name.clone(),
-                source,
+                reason,
             })?;
         self.robots
             .insert(robot.name().to_owned(), Arc::clone(&robot));

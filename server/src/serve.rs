@@ -44,12 +44,12 @@ pub struct Server {
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// The address cannot be listened on.
-    #[error("listen on {address}: {source}")]
+    #[error("listen on {address}: {reason}")]
     Listen {
         /// The address.
         address: SocketAddr,
         /// The system's reason.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// The descriptors do not make a reflection service.
     #[error("reflection: {0}")]
@@ -82,7 +82,7 @@ impl Server {
         };
         let (listener, address) = listening
             .await
-            .map_err(|source| ServeError::Listen { address, source })?;
+            .map_err(|reason| ServeError::Listen { address, reason })?;
         Ok(Self {
             listener,
             address,

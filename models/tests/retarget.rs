@@ -11,11 +11,11 @@ use emp_models::{
     checkpoint::{self, Tensors},
     kinematics::ForwardKinematics,
     retarget::{
-        Effort, KIND, NODE_FEATURES, NetworkConfig, RetargetInput, RetargetNetwork, Retargeter,
-        Solver, Target,
+        Effort, KIND, NetworkConfig, RetargetInput, RetargetNetwork, Retargeter, Solver, Target,
+        features,
     },
 };
-use emp_motion::{Clip, KEY_NODES, skills};
+use emp_motion::{Clip, skills};
 use emp_robot::Robot;
 use proptest::prelude::*;
 use rand::SeedableRng as _;
@@ -69,19 +69,6 @@ fn network(robot: &Robot) -> RetargetNetwork {
     let vars = VarMap::new();
     let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
     RetargetNetwork::new(&NetworkConfig::default(), robot, &builder).unwrap()
-}
-
-fn features(targets: &[Target]) -> Tensor {
-    let mut features = Vec::new();
-    for target in targets {
-        target.write_features(&mut features);
-    }
-    Tensor::from_vec(
-        features,
-        (targets.len(), KEY_NODES, NODE_FEATURES),
-        &Device::Cpu,
-    )
-    .unwrap()
 }
 
 #[test]
@@ -181,7 +168,9 @@ fn a_network_in_training_answers_inside_the_limits() {
             .step_by(50)
             .map(Target::new)
             .collect();
-        let (angles, indices) = network(&robot).predict(&features(&targets)).unwrap();
+        let (angles, indices) = network(&robot)
+            .predict(&features(&targets).unwrap())
+            .unwrap();
         assert_eq!(angles.len(), targets.len() * robot.goal_joints().len());
         assert_eq!(indices.len(), angles.len());
         for row in angles.chunks(robot.goal_joints().len()) {
@@ -207,7 +196,7 @@ fn the_nearest_code_is_the_one_that_brute_force_finds() {
         .step_by(100)
         .map(Target::new)
         .collect();
-    let decoded = network.forward(&features(&targets)).unwrap();
+    let decoded = network.forward(&features(&targets).unwrap()).unwrap();
     let distance =
         |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
     let latent = decoded.latent.to_vec2::<f32>().unwrap();
@@ -234,7 +223,7 @@ fn gradients_reach_every_layer() {
         .step_by(20)
         .map(Target::new)
         .collect();
-    let decoded = network.forward(&features(&targets)).unwrap();
+    let decoded = network.forward(&features(&targets).unwrap()).unwrap();
     let embedding = (decoded.latent.detach() - &decoded.codes)
         .unwrap()
         .sqr()

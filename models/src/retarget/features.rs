@@ -1,6 +1,7 @@
 //! What one human frame asks of a robot, and how the network sees it.
 
-use emp_motion::{KeyNode, KeyNodeFrame, Side};
+use candle_core::{Device, Tensor};
+use emp_motion::{KEY_NODES, KeyNode, KeyNodeFrame, Side};
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 /// The arm bones in the order of [`Target::bones`]: left upper arm, left forearm, right upper arm, right forearm.
@@ -25,6 +26,19 @@ mod body {
     pub(super) const HALF_SHOULDER_WIDTH: f32 = 0.20;
     pub(super) const UPPER_ARM: f32 = 0.28;
     pub(super) const FOREARM: f32 = 0.25;
+}
+
+/// The network's input for a batch: batch × [`KeyNode::ALL`] × [`NODE_FEATURES`].
+///
+/// # Errors
+/// When the tensor cannot be made.
+pub fn features(targets: &[Target]) -> candle_core::Result<Tensor> {
+    let mut features = Vec::with_capacity(targets.len() * KEY_NODES * NODE_FEATURES);
+    for target in targets {
+        target.write_features(&mut features);
+    }
+    let shape = (targets.len(), KEY_NODES, NODE_FEATURES);
+    Tensor::from_vec(features, shape, &Device::Cpu)
 }
 
 /// What one human frame asks of the robot, in the waist's frame (x forward, y left, z up).
@@ -59,7 +73,7 @@ impl Target {
     }
 
     /// Writes the network's input, [`KeyNode::ALL`] × [`NODE_FEATURES`], row-major.
-    pub fn write_features(&self, out: &mut Vec<f32>) {
+    fn write_features(&self, out: &mut Vec<f32>) {
         let positions = self.canonical_positions();
         for node in KeyNode::ALL {
             let start = out.len();
@@ -82,8 +96,8 @@ impl Target {
     }
 
     /// Key-node positions of the canonical body in this pose.
-    fn canonical_positions(&self) -> [Vector3<f32>; emp_motion::KEY_NODES] {
-        let mut positions = [Vector3::zeros(); emp_motion::KEY_NODES];
+    fn canonical_positions(&self) -> [Vector3<f32>; KEY_NODES] {
+        let mut positions = [Vector3::zeros(); KEY_NODES];
         let line = self.shoulder_line.cast::<f32>() * body::HALF_SHOULDER_WIDTH;
         let shoulder = Vector3::new(line.x, line.y, body::SHOULDER_HEIGHT);
         positions[KeyNode::Torso as usize] = Vector3::z() * body::TORSO_HEIGHT;

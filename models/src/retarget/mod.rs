@@ -7,14 +7,14 @@ pub mod smoothing;
 
 use std::{path::Path, sync::Arc};
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device};
 use candle_nn::VarBuilder;
-use emp_motion::{KEY_NODES, KeyNodeFrame};
+use emp_motion::KeyNodeFrame;
 use emp_robot::Robot;
 use nalgebra::Vector3;
 
 pub use self::{
-    features::{BONES, NODE_FEATURES, Target},
+    features::{BONES, Target, features},
     network::{NetworkConfig, RetargetNetwork},
     objective::{Effort, Solver},
     smoothing::Smoother,
@@ -159,16 +159,7 @@ impl Retargeter {
         if targets.is_empty() {
             return Ok((Vec::new(), Vec::new()));
         }
-        let mut features = Vec::with_capacity(targets.len() * KEY_NODES * NODE_FEATURES);
-        for target in targets {
-            target.write_features(&mut features);
-        }
-        let features = Tensor::from_vec(
-            features,
-            (targets.len(), KEY_NODES, NODE_FEATURES),
-            &Device::Cpu,
-        )?;
-        Ok(self.network.predict(&features)?)
+        Ok(self.network.predict(&features(targets)?)?)
     }
 
     fn output(&self, solver: &mut Solver<'_>, target: &Target, angles: &[f64]) -> RetargetOutput {

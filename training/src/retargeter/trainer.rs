@@ -13,9 +13,8 @@ use emp_models::{
     CheckpointMetadata,
     checkpoint::{self, Tensors},
     optimizer::{Adam, AdamConfig},
-    retarget::{self, NODE_FEATURES, NetworkConfig, RetargetNetwork, Target, network::Decoded},
+    retarget::{self, NetworkConfig, RetargetNetwork, Target, features},
 };
-use emp_motion::KEY_NODES;
 use emp_robot::Robot;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -221,7 +220,7 @@ impl Trainer {
         let targets: Vec<Target> = (0..self.settings.batch)
             .map(|_| dataset.sample(&mut rng))
             .collect();
-        let decoded = self.forward(&targets)?;
+        let decoded = self.network.forward(&features(&targets)?)?;
         if step == 0 {
             self.replace_codes(&decoded.latent, |_| true, &mut rng)?;
         }
@@ -245,19 +244,6 @@ impl Trainer {
             gradient_norm,
             perplexity: perplexity(&decoded.indices, self.network.codes()),
         })
-    }
-
-    fn forward(&self, targets: &[Target]) -> Result<Decoded> {
-        let mut features = Vec::with_capacity(targets.len() * KEY_NODES * NODE_FEATURES);
-        for target in targets {
-            target.write_features(&mut features);
-        }
-        let features = Tensor::from_vec(
-            features,
-            (targets.len(), KEY_NODES, NODE_FEATURES),
-            &Device::Cpu,
-        )?;
-        Ok(self.network.forward(&features)?)
     }
 
     /// Moves the codes that `dead` names onto random latent vectors of the batch, and forgets their moments.

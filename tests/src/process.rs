@@ -30,8 +30,9 @@ fn build() -> anyhow::Result<PathBuf> {
         .context("the test's own folder")?
         .to_owned();
     let mut command = Command::new(env!("CARGO"));
+    // The same choice of packages as that of the tests, so that no dependency is compiled with other features again.
     command
-        .args(["build", "--quiet", "-p", "emp-server", "-p", "emp-client"])
+        .args(["build", "--quiet", "--workspace", "--bins"])
         .current_dir(crate::root());
     if folder.ends_with("release") {
         command.arg("--release");

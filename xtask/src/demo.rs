@@ -34,14 +34,13 @@ pub(crate) fn run(workspace: &Workspace, args: &DemoArgs) -> Result<()> {
     if let Some(robot) = FetchedRobot::by_name(&args.robot) {
         robots::ensure(workspace, robot)?;
     }
-    workspace.run(workspace.cargo().args([
-        "build",
-        "--release",
-        "-p",
-        "emp-server",
-        "-p",
-        "emp-demo",
-    ]))?;
+    // The whole workspace's programs, as the tests build them: another choice of packages would choose other features of
+    // their dependencies, and compile these once more.
+    workspace.run(
+        workspace
+            .cargo()
+            .args(["build", "--release", "--workspace", "--bins"]),
+    )?;
     let mut demo = workspace.command(workspace.binary("emp-demo"));
     demo.args(["--robot", &args.robot]);
     if let Some(motion) = &args.motion {

@@ -13,11 +13,13 @@ mod error;
 mod goal_tree;
 mod kinematics;
 mod loader;
+mod mirror;
 mod model;
 mod robot;
 
 pub use error::RobotError;
 pub use kinematics::{FrameKinematics, Kinematics, OutputLayout, Real};
+pub use mirror::JointMirror;
 pub use robot::{
     Foot, GoalNode, Joint, KEY_NODE_NAMES, KEY_NODES, KeyNodeSite, LinkSphere, Robot, robot_folders,
 };

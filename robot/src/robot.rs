@@ -322,6 +322,11 @@ impl Robot {
         model::compile(&files, &self.config, Shapes::All)
     }
 
+    /// The `robot.toml`, which errors name.
+    pub(crate) fn config_file(&self) -> &Path {
+        &self.config_file
+    }
+
     /// Refuses a default pose in which links that may touch do so.
     fn check_default_pose(&self) -> Result<(), RobotError> {
         let q: Vec<f64> = self.joints().map(|joint| joint.default).collect();

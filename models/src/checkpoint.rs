@@ -7,7 +7,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor};
-use emp_robot::Robot;
+use emp_robot::{Joint, Robot};
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
@@ -32,7 +32,7 @@ pub struct CheckpointMetadata {
     pub kind: String,
     /// The robot's name.
     pub robot: String,
-    /// Names of the joints that the model answers, in order.
+    /// Names of the joints that the model answers or reads, in order.
     pub joints: Vec<String>,
     /// Lower and upper limit of each joint, radians.
     pub limits: Vec<[f64; 2]>,
@@ -56,7 +56,16 @@ pub struct CheckpointMetadata {
 impl CheckpointMetadata {
     /// Metadata of a model of `kind` that answers `robot`'s goal joints.
     pub fn for_goal_joints(kind: &str, robot: &Robot) -> Self {
-        let joints = robot.goal_joints();
+        Self::for_joints(kind, robot, robot.goal_joints())
+    }
+
+    /// Metadata of a model of `kind` that reads or answers these joints of `robot`.
+    pub fn for_joints<'a>(
+        kind: &str,
+        robot: &Robot,
+        joints: impl IntoIterator<Item = &'a Joint>,
+    ) -> Self {
+        let joints: Vec<&Joint> = joints.into_iter().collect();
         Self {
             format: FORMAT,
             kind: kind.to_owned(),
@@ -78,15 +87,15 @@ impl CheckpointMetadata {
         self.sha256.get(..12).unwrap_or(&self.sha256)
     }
 
-    /// Checks that the model was trained for this robot: name, joints, limits and gains.
+    /// Checks that the model was trained for the robot of `expected`: kind, name, joints, limits, gains, action scale.
     ///
     /// # Errors
     /// [`ModelError::Mismatch`] with the first field that differs.
-    pub fn check(&self, path: &Path, kind: &str, robot: &Robot) -> Result<(), ModelError> {
-        let expected = Self::for_goal_joints(kind, robot);
+    pub fn check(&self, path: &Path, expected: &Self) -> Result<(), ModelError> {
+        let robot = &expected.robot;
         let fields = [
-            ("kind", self.kind.clone(), expected.kind),
-            ("robot", self.robot.clone(), expected.robot),
+            ("kind", self.kind.clone(), expected.kind.clone()),
+            ("robot", self.robot.clone(), expected.robot.clone()),
             (
                 "joints",
                 format!("{:?}", self.joints),
@@ -102,10 +111,15 @@ impl CheckpointMetadata {
                 format!("{:?}", self.gains),
                 format!("{:?}", expected.gains),
             ),
+            (
+                "action_scale",
+                self.action_scale.to_string(),
+                expected.action_scale.to_string(),
+            ),
         ];
         for (field, found, expected) in fields {
             if found != expected {
-                let (path, robot) = (path.to_owned(), robot.name().to_owned());
+                let (path, robot) = (path.to_owned(), robot.clone());
                 return Err(ModelError::Mismatch {
                     path,
                     field,

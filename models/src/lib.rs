@@ -1,15 +1,18 @@
-//! Networks and what they need around them: the linear op, robot kinematics as a differentiable op, checkpoints, and the
-//! human-to-robot retargeter.
+//! Networks and what they need around them: the linear op, robot kinematics as a differentiable op, checkpoints, the
+//! human-to-robot retargeter, the observation history, the lower-body policy, and the controller that puts them in order.
 //!
-//! This crate turns human key nodes into robot joint angles. It never opens a socket, never steps physics, and never
+//! This crate turns human key nodes into robot joint angles and robot states into joint targets. It never opens a socket, never steps physics, and never
 //! reads a motion file: frames come in as values, answers go out as values.
 #![forbid(unsafe_code)]
 
 pub mod checkpoint;
+pub mod controller;
 pub mod error;
 pub mod kinematics;
 pub mod linear;
+pub mod observation;
 pub mod optimizer;
+pub mod policy;
 pub mod retarget;
 
 pub use checkpoint::CheckpointMetadata;

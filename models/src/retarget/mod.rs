@@ -64,7 +64,7 @@ impl Retargeter {
     /// When the file is damaged, or was trained for another robot, other limits, or another network.
     pub fn load(weights: &Path, robot: Arc<Robot>) -> Result<Self, ModelError> {
         let (metadata, tensors) = checkpoint::load(weights)?;
-        metadata.check(weights, KIND, &robot)?;
+        metadata.check(weights, &CheckpointMetadata::for_goal_joints(KIND, &robot))?;
         let damaged = |reason: String| ModelError::Checkpoint {
             path: weights.to_owned(),
             reason,

@@ -104,7 +104,7 @@ impl Trainer {
     /// When the checkpoint is damaged, or its run had other settings or another robot.
     pub fn resume(robot: Arc<Robot>, settings: Settings, path: &Path) -> Result<Self> {
         let (metadata, tensors) = checkpoint::load(path)?;
-        metadata.check(path, RUN_KIND, &robot)?;
+        metadata.check(path, &CheckpointMetadata::for_goal_joints(RUN_KIND, &robot))?;
         let saved: Progress = serde_json::from_value(metadata.training)
             .with_context(|| format!("{}: metadata field training", path.display()))?;
         ensure!(

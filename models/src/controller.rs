@@ -1,0 +1,188 @@
+//! The controller: history → goal filter → policy → joint targets, batched over robots.
+//!
+//! The server, the evaluation and the demo all go through [`Controller::step`]: what is evaluated is what is served.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    ModelError,
+    observation::{History, ObservationLayout, RobotState},
+    policy::Policy,
+};
+
+/// Changes goals before they are executed: the EMP, or one of the simple rules of [`crate::filters`] to compare it with.
+pub trait GoalFilter: Send + Sync {
+    /// The filter's name, as a controller is called.
+    fn name(&self) -> &str;
+
+    /// Replaces each goal by the one to execute.
+    ///
+    /// # Errors
+    /// When a model fails; then the whole batch has no answer.
+    fn filter(&self, batch: &mut [FilterItem<'_>]) -> Result<(), ModelError>;
+}
+
+/// One robot's goal, on its way through a filter.
+#[derive(Debug)]
+pub struct FilterItem<'a> {
+    /// The stack S_t with the goal that was asked for in its newest frame.
+    pub observation: &'a [f32],
+    /// The goal, rad: in, as asked for; out, to be executed.
+    pub goal: &'a mut [f32],
+    /// What the filter remembers of this robot; empty at reset, otherwise the filter's own.
+    pub memory: &'a mut Vec<f32>,
+}
+
+/// One robot's past.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ControllerState {
+    history: History,
+    filter_memory: Vec<f32>,
+}
+
+impl ControllerState {
+    /// Forgets everything: the next step is the first of an episode.
+    pub fn reset(&mut self) {
+        self.history.reset();
+        self.filter_memory.clear();
+    }
+
+    /// The last frames.
+    pub fn history(&self) -> &History {
+        &self.history
+    }
+}
+
+/// What one robot tells the controller in a control period.
+#[derive(Clone, Copy, Debug)]
+pub struct ControllerInput<'a> {
+    /// What the robot measures.
+    pub state: RobotState<'a>,
+    /// The goal that is asked for: angles of the goal joints, rad.
+    pub goal: &'a [f32],
+}
+
+/// What the controller tells one robot in a control period.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ControllerOutput {
+    /// The goal to execute: angles of the goal joints, rad.
+    pub goal: Vec<f32>,
+    /// The policy's action, policy units.
+    pub action: Vec<f32>,
+    /// Targets of the leg joints, rad, inside their ranges.
+    pub leg_targets: Vec<f32>,
+}
+
+/// A policy with an optional goal filter before it.
+#[derive(Clone)]
+pub struct Controller {
+    policy: Arc<Policy>,
+    filter: Option<Arc<dyn GoalFilter>>,
+}
+
+impl Controller {
+    /// The name of the controller without a filter: the goal goes to the robot as it is.
+    pub const DECOUPLED: &'static str = "decoupled";
+
+    /// A controller; without a filter it is the paper's decoupled policy.
+    pub fn new(policy: Arc<Policy>, filter: Option<Arc<dyn GoalFilter>>) -> Self {
+        Self { policy, filter }
+    }
+
+    /// The filter's name, or [`Self::DECOUPLED`].
+    pub fn name(&self) -> &str {
+        self.filter
+            .as_ref()
+            .map_or(Self::DECOUPLED, |filter| filter.name())
+    }
+
+    /// The policy.
+    pub fn policy(&self) -> &Arc<Policy> {
+        &self.policy
+    }
+
+    /// A robot without a past.
+    pub fn state(&self) -> ControllerState {
+        ControllerState {
+            history: History::new(*self.layout()),
+            filter_memory: Vec::new(),
+        }
+    }
+
+    fn layout(&self) -> &ObservationLayout {
+        self.policy.layout()
+    }
+
+    /// One control period of a batch of robots.
+    ///
+    /// # Errors
+    /// [`ModelError::Frame`] if an input has another number of joints than the robot, before any state has changed; when a
+    /// model fails.
+    pub fn step(
+        &self,
+        batch: &mut [(&mut ControllerState, ControllerInput<'_>)],
+    ) -> Result<Vec<ControllerOutput>, ModelError> {
+        for (index, (_, input)) in batch.iter().enumerate() {
+            self.check(index, input)?;
+        }
+        for (robot, input) in batch.iter_mut() {
+            robot.history.push(&input.state, input.goal);
+        }
+        let mut goals: Vec<Vec<f32>> = batch.iter().map(|(_, input)| input.goal.to_vec()).collect();
+        if let Some(filter) = &self.filter {
+            let robots = batch.iter_mut().zip(&mut goals);
+            let mut items: Vec<FilterItem<'_>> = robots
+                .map(|((robot, _), goal)| FilterItem {
+                    observation: robot.history.stack(),
+                    goal,
+                    memory: &mut robot.filter_memory,
+                })
+                .collect();
+            filter.filter(&mut items)?;
+            for ((robot, _), goal) in batch.iter_mut().zip(&goals) {
+                robot.history.set_newest_goal(goal);
+            }
+        }
+        let mut observations = Vec::with_capacity(batch.len() * self.layout().width());
+        for (robot, _) in batch.iter() {
+            observations.extend_from_slice(robot.history.stack());
+        }
+        let actions = self.policy.actions(&observations)?;
+        let legs = self.layout().last_action().len();
+        let answers = batch.iter_mut().zip(goals).zip(actions.chunks_exact(legs));
+        Ok(answers
+            .map(|(((robot, _), goal), action)| {
+                robot.history.set_last_action(action);
+                ControllerOutput {
+                    goal,
+                    action: action.to_vec(),
+                    leg_targets: self.policy.leg_targets(action),
+                }
+            })
+            .collect())
+    }
+
+    fn check(&self, index: usize, input: &ControllerInput<'_>) -> Result<(), ModelError> {
+        let layout = self.layout();
+        let widths = [
+            (
+                "joint positions",
+                input.state.joint_positions.len(),
+                layout.joint_positions().len(),
+            ),
+            ("goal angles", input.goal.len(), layout.goal().len()),
+        ];
+        match widths
+            .into_iter()
+            .find(|(_, found, expected)| found != expected)
+        {
+            Some((what, found, expected)) => Err(ModelError::Frame {
+                index,
+                reason: format!("{found} {what}, expected {expected}"),
+            }),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,469 @@
+//! The lower-body policy π: from the stack S_t to twelve leg actions (paper, section IV).
+//!
+//! ```text
+//! S_t (15 × 57) ──constant history map──▶ features (4 × 57) ──normalise──▶ MLP, ELU ──▶ action (12)
+//! ```
+//!
+//! The first layer is fixed: it mixes the frames of the stack, the same way for each number of a frame, into the present,
+//! two differences and one deviation from the mean. Raw frames hold the same information, but learning from them took
+//! many times as long.
+
+use std::{path::Path, sync::Arc};
+
+use candle_core::{DType, Device, Tensor};
+use candle_nn::VarBuilder;
+use emp_robot::Robot;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    CheckpointMetadata, ModelError,
+    checkpoint::{self, Tensors},
+    linear::Linear,
+    observation::{HISTORY, ObservationLayout},
+};
+
+/// The kind that a policy's checkpoint names.
+pub const KIND: &str = "policy";
+
+/// Normalised features are clipped to this many standard deviations.
+const CLIP: f32 = 8.0;
+
+/// Prefix of the network's tensors in a checkpoint.
+pub const NETWORK_PREFIX: &str = "policy";
+
+/// Names of the normaliser's tensors in a checkpoint.
+const NORMALIZER: [&str; 2] = ["normalizer.mean", "normalizer.scale"];
+
+/// What a policy's checkpoint says of its shape.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PolicyConfig {
+    /// Where each part of the observation stands.
+    pub observation: ObservationLayout,
+    /// The constant first layer: feature block k is `Σ_t history_map[k][t] · s_t`, frames oldest first.
+    pub history_map: Vec<Vec<f32>>,
+    /// Widths of the hidden layers.
+    pub hidden: Vec<usize>,
+}
+
+impl PolicyConfig {
+    /// The shipped shape for `robot`: s_t, s_t − s_{t−1}, s_{t−1} − s_{t−3} and s_t − mean, then `hidden` layers.
+    pub fn new(robot: &Robot, hidden: Vec<usize>) -> Self {
+        let newest = HISTORY - 1;
+        let mut map = vec![vec![0.0; HISTORY]; 4];
+        map[0][newest] = 1.0;
+        map[1][newest] = 1.0;
+        map[1][newest - 1] = -1.0;
+        map[2][newest - 1] = 1.0;
+        map[2][newest - 3] = -1.0;
+        map[3].fill(-1.0 / HISTORY as f32);
+        map[3][newest] += 1.0;
+        Self {
+            observation: ObservationLayout::new(robot, HISTORY),
+            history_map: map,
+            hidden,
+        }
+    }
+
+    /// Numbers that the network reads: one frame for each row of the history map.
+    pub fn features(&self) -> usize {
+        self.history_map.len() * self.observation.frame_width()
+    }
+
+    /// Applies the history map to stacks (N × [`ObservationLayout::width`]); N × [`features`](Self::features).
+    pub fn map_history(&self, observations: &[f32], features: &mut Vec<f32>) {
+        let width = self.observation.frame_width();
+        features.clear();
+        for stack in observations.chunks_exact(self.observation.width()) {
+            for weights in &self.history_map {
+                let start = features.len();
+                features.resize(start + width, 0.0);
+                let block = &mut features[start..];
+                for (frame, &weight) in stack.chunks_exact(width).zip(weights) {
+                    if weight != 0.0 {
+                        for (feature, value) in block.iter_mut().zip(frame) {
+                            *feature += weight * value;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// Refuses a shape that does not fit `robot`.
+    fn check(&self, robot: &Robot) -> Result<(), String> {
+        let expected = ObservationLayout::new(robot, self.observation.history());
+        if self.observation != expected {
+            return Err(format!(
+                "the observation is {:?}, expected {expected:?}",
+                self.observation
+            ));
+        }
+        let history = self.observation.history();
+        match self.history_map.iter().find(|row| row.len() != history) {
+            Some(row) => Err(format!(
+                "a row of history_map has {} numbers, expected {history}",
+                row.len()
+            )),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Brings features to zero mean and unit size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Normalizer {
+    /// Mean of each feature.
+    pub mean: Vec<f32>,
+    /// What each deviation is multiplied by.
+    pub scale: Vec<f32>,
+}
+
+impl Normalizer {
+    /// Leaves features as they are, but for the clipping.
+    pub fn identity(features: usize) -> Self {
+        Self {
+            mean: vec![0.0; features],
+            scale: vec![1.0; features],
+        }
+    }
+
+    /// Normalises rows of features in place and clips them to ±8.
+    pub fn apply(&self, features: &mut [f32]) {
+        for row in features.chunks_exact_mut(self.mean.len()) {
+            for ((value, mean), scale) in row.iter_mut().zip(&self.mean).zip(&self.scale) {
+                *value = ((*value - mean) * scale).clamp(-CLIP, CLIP);
+            }
+        }
+    }
+
+    fn tensors(&self) -> candle_core::Result<[(String, Tensor); 2]> {
+        let tensor = |name: &str, values: &[f32]| {
+            Ok::<_, candle_core::Error>((name.to_owned(), Tensor::new(values, &Device::Cpu)?))
+        };
+        Ok([
+            tensor(NORMALIZER[0], &self.mean)?,
+            tensor(NORMALIZER[1], &self.scale)?,
+        ])
+    }
+
+    fn from_tensors(tensors: &Tensors, features: usize) -> Result<Self, String> {
+        let read = |name: &str| {
+            let tensor = tensors.get(name).ok_or(format!("no tensor `{name}`"))?;
+            let values = tensor
+                .to_vec1::<f32>()
+                .map_err(|e| format!("tensor `{name}`: {e}"))?;
+            if values.len() != features || values.iter().any(|value| !value.is_finite()) {
+                return Err(format!(
+                    "tensor `{name}`: expected {features} finite numbers, got {}",
+                    values.len()
+                ));
+            }
+            Ok(values)
+        };
+        Ok(Self {
+            mean: read(NORMALIZER[0])?,
+            scale: read(NORMALIZER[1])?,
+        })
+    }
+}
+
+/// Fully connected layers with ELU between them.
+#[derive(Clone, Debug)]
+pub struct Mlp {
+    layers: Vec<Linear>,
+}
+
+impl Mlp {
+    /// Layers `inputs → hidden… → outputs`, their tensors named `0.weight`, `0.bias`, `1.weight`, … in `vars`.
+    ///
+    /// # Errors
+    /// When `vars` holds tensors of those names with other shapes.
+    pub fn new(
+        inputs: usize,
+        hidden: &[usize],
+        outputs: usize,
+        vars: &VarBuilder<'_>,
+    ) -> candle_core::Result<Self> {
+        let widths: Vec<usize> = [&[inputs], hidden, &[outputs]].concat();
+        let layers = widths
+            .windows(2)
+            .enumerate()
+            .map(|(i, pair)| Linear::new(pair[0], pair[1], &vars.pp(i)));
+        Ok(Self {
+            layers: layers.collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// Applies the layers to rows of inputs.
+    ///
+    /// # Errors
+    /// When `x` has another width or type.
+    pub fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
+        let mut x = x.clone();
+        for (i, layer) in self.layers.iter().enumerate() {
+            x = layer.forward(&x)?;
+            if i + 1 < self.layers.len() {
+                x = x.elu(1.0)?;
+            }
+        }
+        Ok(x)
+    }
+}
+
+/// A policy with its robot.
+#[derive(Debug)]
+pub struct Policy {
+    robot: Arc<Robot>,
+    config: PolicyConfig,
+    normalizer: Normalizer,
+    network: Mlp,
+    metadata: CheckpointMetadata,
+}
+
+impl Policy {
+    /// Loads weights that were trained for `robot`.
+    ///
+    /// # Errors
+    /// When the file is damaged, or was trained for another robot or another observation.
+    pub fn load(weights: &Path, robot: Arc<Robot>) -> Result<Self, ModelError> {
+        let (metadata, tensors) = checkpoint::load(weights)?;
+        metadata.check(weights, &policy_metadata(&robot))?;
+        let damaged = |reason: String| ModelError::Checkpoint {
+            path: weights.to_owned(),
+            reason,
+        };
+        let config: PolicyConfig = serde_json::from_value(metadata.config.clone())
+            .map_err(|e| damaged(format!("metadata field config: {e}")))?;
+        Self::from_tensors(config, robot, tensors, metadata).map_err(damaged)
+    }
+
+    /// Puts a policy together from a checkpoint's tensors.
+    ///
+    /// # Errors
+    /// Says which part does not fit the robot or the shape.
+    pub fn from_tensors(
+        config: PolicyConfig,
+        robot: Arc<Robot>,
+        tensors: Tensors,
+        metadata: CheckpointMetadata,
+    ) -> Result<Self, String> {
+        config.check(&robot)?;
+        let normalizer = Normalizer::from_tensors(&tensors, config.features())?;
+        let vars =
+            VarBuilder::from_tensors(tensors.into_iter().collect(), DType::F32, &Device::Cpu);
+        let outputs = robot.leg_joints().len();
+        let vars = vars.pp(NETWORK_PREFIX);
+        let network = Mlp::new(config.features(), &config.hidden, outputs, &vars)
+            .map_err(|e| format!("the network's tensors: {e}"))?;
+        Ok(Self {
+            robot,
+            config,
+            normalizer,
+            network,
+            metadata,
+        })
+    }
+
+    /// Writes the tensors of a policy: `network` (named as [`Mlp::new`] names them) as f16, the normaliser as f32.
+    ///
+    /// `training` and `git_revision` go into the metadata.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn save(
+        path: &Path,
+        robot: &Robot,
+        config: &PolicyConfig,
+        normalizer: &Normalizer,
+        network: &Tensors,
+        training: serde_json::Value,
+        git_revision: String,
+    ) -> Result<CheckpointMetadata, ModelError> {
+        let mut metadata = policy_metadata(robot);
+        metadata.history_length = config.observation.history();
+        metadata.config = serde_json::to_value(config).map_err(candle_core::Error::wrap)?;
+        metadata.training = training;
+        metadata.git_revision = git_revision;
+        let mut tensors: Tensors = normalizer.tensors()?.into_iter().collect();
+        for (name, tensor) in network {
+            let name = format!("{NETWORK_PREFIX}.{name}");
+            tensors.insert(name, tensor.to_dtype(DType::F16)?);
+        }
+        checkpoint::save(path, metadata, &tensors)
+    }
+
+    /// The robot that the actions are for.
+    pub fn robot(&self) -> &Arc<Robot> {
+        &self.robot
+    }
+
+    /// What the policy reads, and how.
+    pub fn config(&self) -> &PolicyConfig {
+        &self.config
+    }
+
+    /// Where each part of the observation stands.
+    pub fn layout(&self) -> &ObservationLayout {
+        &self.config.observation
+    }
+
+    /// What the weights say of themselves.
+    pub fn metadata(&self) -> &CheckpointMetadata {
+        &self.metadata
+    }
+
+    /// The features (N × [`PolicyConfig::features`], not normalised) of stacks (N × [`ObservationLayout::width`]).
+    pub fn features(&self, observations: &[f32]) -> Vec<f32> {
+        let mut features = Vec::new();
+        self.config.map_history(observations, &mut features);
+        features
+    }
+
+    /// The actions (N × leg joints, policy units) for features that are not normalised.
+    ///
+    /// # Errors
+    /// When the number of features is no multiple of [`PolicyConfig::features`].
+    pub fn actions_from_features(&self, mut features: Vec<f32>) -> Result<Vec<f32>, ModelError> {
+        if features.is_empty() {
+            return Ok(Vec::new());
+        }
+        self.normalizer.apply(&mut features);
+        let width = self.config.features();
+        let rows = features.len() / width;
+        let features = Tensor::from_vec(features, (rows, width), &Device::Cpu)?;
+        let actions = self.network.forward(&features)?;
+        Ok(actions.flatten_all()?.to_vec1()?)
+    }
+
+    /// The actions (N × leg joints, policy units) for stacks (N × [`ObservationLayout::width`]).
+    ///
+    /// # Errors
+    /// When the tensor library fails.
+    pub fn actions(&self, observations: &[f32]) -> Result<Vec<f32>, ModelError> {
+        self.actions_from_features(self.features(observations))
+    }
+
+    /// Leg targets (rad, inside the joints' ranges) of one action: default + scale · action.
+    pub fn leg_targets(&self, action: &[f32]) -> Vec<f32> {
+        leg_targets(&self.robot, action)
+    }
+}
+
+/// Leg targets (rad, inside the joints' ranges) of one action in policy units: default + scale · action.
+pub fn leg_targets(robot: &Robot, action: &[f32]) -> Vec<f32> {
+    let scale = robot.action_scale();
+    let joints = robot.leg_joints().iter().zip(action);
+    joints
+        .map(|(joint, &action)| {
+            let target = joint.default + scale * f64::from(action);
+            target.clamp(joint.range[0], joint.range[1]) as f32
+        })
+        .collect()
+}
+
+/// What a policy's metadata must say to fit `robot`: it reads all joints, so all their limits and gains matter.
+fn policy_metadata(robot: &Robot) -> CheckpointMetadata {
+    CheckpointMetadata::for_joints(KIND, robot, robot.joints())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_nn::VarMap;
+
+    fn robot() -> Arc<Robot> {
+        Arc::new(Robot::load("../robots/emp27".as_ref()).unwrap())
+    }
+
+    fn save(path: &Path, config: &PolicyConfig, robot: &Robot) {
+        let vars = VarMap::new();
+        let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
+        let outputs = robot.leg_joints().len();
+        Mlp::new(config.features(), &config.hidden, outputs, &builder).unwrap();
+        let network = vars.data().lock().unwrap();
+        let network: Tensors = network
+            .iter()
+            .map(|(name, var)| (name.clone(), var.as_detached_tensor()))
+            .collect();
+        let normalizer = Normalizer::identity(config.features());
+        let training = serde_json::json!({});
+        Policy::save(
+            path,
+            robot,
+            config,
+            &normalizer,
+            &network,
+            training,
+            String::new(),
+        )
+        .unwrap();
+    }
+
+    #[test]
+    fn the_history_map_is_differences_and_a_deviation() {
+        let robot = robot();
+        let config = PolicyConfig::new(&robot, vec![8]);
+        let width = config.observation.frame_width();
+        // Frame t holds t² everywhere.
+        let stack: Vec<f32> = (0..HISTORY * width)
+            .map(|i| ((i / width) as f32).powi(2))
+            .collect();
+        let mut features = Vec::new();
+        config.map_history(&stack, &mut features);
+        let mean = 1015.0 / 15.0;
+        let expected = [196.0, 196.0 - 169.0, 169.0 - 121.0, 196.0 - mean];
+        for (block, expected) in features.chunks(width).zip(expected) {
+            assert!(
+                block.iter().all(|x| (x - expected).abs() < 1e-3),
+                "{block:?} {expected}"
+            );
+        }
+        assert_eq!(features.len(), config.features());
+    }
+
+    #[test]
+    fn a_saved_policy_loads_and_a_batch_equals_its_rows() {
+        let (robot, folder) = (robot(), tempfile::tempdir().unwrap());
+        let path = folder.path().join("policy.safetensors");
+        save(&path, &PolicyConfig::new(&robot, vec![16, 8]), &robot);
+        let policy = Policy::load(&path, Arc::clone(&robot)).unwrap();
+        assert_eq!(policy.metadata().history_length, HISTORY);
+        let width = policy.layout().width();
+        let stacks: Vec<f32> = (0..5 * width).map(|i| (i as f32 * 0.37).sin()).collect();
+        let batch = policy.actions(&stacks).unwrap();
+        assert!(batch.iter().any(|action| action.abs() > 1e-3));
+        for (stack, expected) in stacks.chunks(width).zip(batch.chunks(12)) {
+            for (a, b) in policy.actions(stack).unwrap().iter().zip(expected) {
+                assert!((a - b).abs() < 1e-5, "{a} {b}");
+            }
+        }
+        assert!(policy.actions(&[]).unwrap().is_empty());
+    }
+
+    #[test]
+    fn another_observation_is_refused_by_name() {
+        let (robot, folder) = (robot(), tempfile::tempdir().unwrap());
+        let path = folder.path().join("policy.safetensors");
+        let mut config = PolicyConfig::new(&robot, vec![8]);
+        config.history_map[2].pop();
+        save(&path, &config, &robot);
+        let error = Policy::load(&path, robot).unwrap_err().to_string();
+        assert!(error.contains("history_map"), "{error}");
+    }
+
+    #[test]
+    fn leg_targets_stay_inside_the_ranges() {
+        let robot = robot();
+        let rest = leg_targets(&robot, &[0.0; 12]);
+        for (target, joint) in rest.iter().zip(robot.leg_joints()) {
+            assert!((f64::from(*target) - joint.default).abs() < 1e-6);
+        }
+        for (target, joint) in leg_targets(&robot, &[1e9; 12])
+            .iter()
+            .zip(robot.leg_joints())
+        {
+            assert_eq!(*target, joint.range[1] as f32);
+        }
+    }
+}

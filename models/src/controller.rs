@@ -27,7 +27,7 @@ pub trait GoalFilter: Send + Sync {
 /// One robot's goal, on its way through a filter.
 #[derive(Debug)]
 pub struct FilterItem<'a> {
-    /// The stack S_t with the goal that was asked for in its newest frame.
+    /// The stack `S_t` with the goal that was asked for in its newest frame.
     pub observation: &'a [f32],
     /// The goal, rad: in, as asked for; out, to be executed.
     pub goal: &'a mut [f32],

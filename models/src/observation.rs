@@ -1,4 +1,4 @@
-//! The robot's state as the policy and the EMP see it: one frame s_t, and the stack S_t of the last frames (paper, section
+//! The robot's state as the policy and the EMP see it: one frame `s_t`, and the stack `S_t` of the last frames (paper, section
 //! IV-B; erratum E1).
 //!
 //! A frame is `[q | a_{t−1} | roll, pitch, yaw | g]`: joint positions (goal joints, then leg joints; rad), the last action
@@ -179,12 +179,12 @@ impl History {
         self.last_action.copy_from_slice(action);
     }
 
-    /// The stack S_t, oldest frame first: [`ObservationLayout::width`] numbers.
+    /// The stack `S_t`, oldest frame first: [`ObservationLayout::width`] numbers.
     pub fn stack(&self) -> &[f32] {
         &self.frames
     }
 
-    /// The newest frame s_t.
+    /// The newest frame `s_t`.
     pub fn newest(&self) -> &[f32] {
         &self.frames[self.layout.newest()]
     }

@@ -1,4 +1,4 @@
-//! The lower-body policy π: from the stack S_t to twelve leg actions (paper, section IV).
+//! The lower-body policy π: from the stack `S_t` to twelve leg actions (paper, section IV).
 //!
 //! ```text
 //! S_t (15 × 57) ──constant history map──▶ features (4 × 57) ──normalise──▶ MLP, ELU ──▶ action (12)
@@ -47,7 +47,7 @@ pub struct PolicyConfig {
 }
 
 impl PolicyConfig {
-    /// The shipped shape for `robot`: s_t, s_t − s_{t−1}, s_{t−1} − s_{t−3} and s_t − mean, then `hidden` layers.
+    /// The shipped shape for `robot`: `s_t`, `s_t` − `s_{t−1}`, `s_{t−1}` − `s_{t−3}` and `s_t` − mean, then `hidden` layers.
     pub fn new(robot: &Robot, hidden: Vec<usize>) -> Self {
         let newest = HISTORY - 1;
         let mut map = vec![vec![0.0; HISTORY]; 4];

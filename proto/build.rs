@@ -5,11 +5,13 @@ use std::{env, error::Error, fs, path::PathBuf};
 
 use prost::Message as _;
 
-const FILES: [&str; 4] = [
+const FILES: [&str; 6] = [
     "emp/v1/frame.proto",
     "emp/v1/model_service.proto",
     "emp/v1/motion_service.proto",
     "emp/v1/pose.proto",
+    "emp/v1/robot_state.proto",
+    "emp/v1/rollout_service.proto",
 ];
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -19,6 +21,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     fs::write(out, descriptors.encode_to_vec())?;
     tonic_prost_build::configure()
         .emit_rerun_if_changed(false)
+        .generate_default_stubs(true)
         .compile_fds(descriptors)?;
     Ok(())
 }

@@ -34,7 +34,10 @@ mod tests {
             .filter(|file| file.package() == "emp.v1")
             .flat_map(|file| file.service.iter().map(ServiceDescriptorProto::name))
             .collect();
-        assert_eq!(services, ["ModelService", "MotionService"]);
+        assert_eq!(
+            services,
+            ["ModelService", "MotionService", "RolloutService"]
+        );
 
         let pose = set
             .file

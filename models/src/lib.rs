@@ -5,6 +5,7 @@
 //! reads a motion file: frames come in as values, answers go out as values.
 #![forbid(unsafe_code)]
 
+pub mod activation;
 pub mod checkpoint;
 pub mod controller;
 pub mod error;

@@ -16,7 +16,7 @@ use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    CheckpointMetadata, ModelError,
+    CheckpointMetadata, ModelError, activation,
     checkpoint::{self, Tensors},
     linear::Linear,
     observation::{HISTORY, ObservationLayout},
@@ -204,7 +204,7 @@ impl Mlp {
         for (i, layer) in self.layers.iter().enumerate() {
             x = layer.forward(&x)?;
             if i + 1 < self.layers.len() {
-                x = x.elu(1.0)?;
+                x = activation::elu(&x)?;
             }
         }
         Ok(x)

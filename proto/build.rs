@@ -21,7 +21,6 @@ fn main() -> Result<(), Box<dyn Error>> {
     fs::write(out, descriptors.encode_to_vec())?;
     tonic_prost_build::configure()
         .emit_rerun_if_changed(false)
-        .generate_default_stubs(true)
         .compile_fds(descriptors)?;
     Ok(())
 }

@@ -53,6 +53,11 @@ impl ControllerState {
     pub fn history(&self) -> &History {
         &self.history
     }
+
+    /// The last frames, to put an episode's past in.
+    pub fn history_mut(&mut self) -> &mut History {
+        &mut self.history
+    }
 }
 
 /// What one robot tells the controller in a control period.

@@ -108,8 +108,9 @@ pub struct History {
     /// The stack, oldest frame first.
     frames: Vec<f32>,
     last_action: Vec<f32>,
-    /// Yaw of the first frame, rad; none before it.
+    /// Yaw of the base when the episode started, rad; none until it is known.
     heading: Option<f64>,
+    is_empty: bool,
 }
 
 impl History {
@@ -120,6 +121,7 @@ impl History {
             frames: vec![0.0; layout.width()],
             last_action: vec![0.0; layout.actions],
             heading: None,
+            is_empty: true,
         }
     }
 
@@ -127,16 +129,23 @@ impl History {
     pub fn reset(&mut self) {
         self.last_action.fill(0.0);
         self.heading = None;
+        self.is_empty = true;
     }
 
     /// Whether no frame was pushed since the last reset.
     pub fn is_empty(&self) -> bool {
-        self.heading.is_none()
+        self.is_empty
     }
 
-    /// Yaw of the base at the first frame, rad; none before it.
+    /// Yaw of the base when the episode started, rad: that of the first frame, unless it was set; none before it.
     pub fn heading(&self) -> Option<f64> {
         self.heading
+    }
+
+    /// Sets the yaw of the base at the episode's start, rad, for a history that does not begin there. Frames that were
+    /// pushed before keep the heading that they had.
+    pub fn set_heading(&mut self, heading: f64) {
+        self.heading = Some(heading);
     }
 
     /// Adds the frame of this moment: the state, the last action, and the goal (rad). The oldest frame goes.
@@ -145,7 +154,7 @@ impl History {
     /// If the state or the goal has another number of joints than the layout.
     pub fn push(&mut self, state: &RobotState<'_>, goal: &[f32]) {
         let [roll, pitch, yaw] = roll_pitch_yaw(&state.orientation);
-        let is_first = self.heading.is_none();
+        let is_first = std::mem::take(&mut self.is_empty);
         let heading = *self.heading.get_or_insert(yaw);
         let width = self.layout.frame_width();
         self.frames.copy_within(width.., 0);
@@ -278,6 +287,23 @@ mod tests {
         assert_eq!(frame[layout.last_action()], [0.0; 12]);
         history.set_newest_goal(&[2.0; 15]);
         assert_eq!(history.stack()[layout.newest_goal()], [2.0; 15]);
+    }
+
+    #[test]
+    fn the_heading_can_be_that_of_a_frame_before_the_first() {
+        let layout = layout();
+        let mut history = History::new(layout);
+        history.set_heading(0.5);
+        assert!(history.is_empty());
+        let state = RobotState {
+            joint_positions: &[0.0; 27],
+            orientation: yawed(0.75),
+        };
+        history.push(&state, &[0.0; 15]);
+        for frame in history.stack().chunks(layout.frame_width()) {
+            let yaw = frame[layout.orientation()][2];
+            assert!((yaw - 0.25).abs() < 1e-6, "{yaw}");
+        }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Contacts of a robot with itself.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
 
 use emp_robot::Robot;
 use mujoco_rs::prelude::*;
@@ -9,20 +9,18 @@ use mujoco_rs::wrappers::mj_auxiliary::MjContact;
 use crate::SimError;
 use crate::replay::{check_angles, set_pose};
 
-/// The pairs of geoms whose contact is a self-collision, by their numbers in a model.
-pub(crate) struct ContactPairs(HashSet<[i32; 2]>);
+/// The pairs of geoms whose contact is a self-collision, by their numbers in a model: from both, the smaller first, to
+/// the one that the robot names first.
+#[derive(Debug)]
+pub(crate) struct ContactPairs(HashMap<[i32; 2], i32>);
 
 impl ContactPairs {
     pub(crate) fn new(robot: &Robot, model: &MjModel) -> Result<Self, SimError> {
-        let id = |geom: &String| {
-            let id = model.name_to_id(MjtObjBase::mjOBJ_GEOM, geom);
-            id.map(|id| id as i32)
-                .ok_or_else(|| SimError::MissingGeom { geom: geom.clone() })
-        };
-        let pairs = robot
-            .contact_pairs()
-            .iter()
-            .map(|[first, second]| Ok(ordered([id(first)?, id(second)?])));
+        let id = |geom: &String| geom_id(model, geom).map(|id| id as i32);
+        let pairs = robot.contact_pairs().iter().map(|[first, second]| {
+            let first = id(first)?;
+            Ok((ordered([first, id(second)?]), first))
+        });
         Ok(Self(pairs.collect::<Result<_, SimError>>()?))
     }
 
@@ -30,12 +28,26 @@ impl ContactPairs {
     pub(crate) fn touch(&self, contacts: &[MjContact]) -> bool {
         contacts
             .iter()
-            .any(|contact| contact.dist <= 0.0 && self.0.contains(&ordered(contact.geom)))
+            .any(|contact| self.touching(contact).is_some())
+    }
+
+    /// The geom that the robot names first of the pair that touches here, if one does.
+    pub(crate) fn touching(&self, contact: &MjContact) -> Option<i32> {
+        let pair = (contact.dist <= 0.0).then(|| ordered(contact.geom))?;
+        self.0.get(&pair).copied()
     }
 }
 
 fn ordered([first, second]: [i32; 2]) -> [i32; 2] {
     [first.min(second), first.max(second)]
+}
+
+/// Number of a geom of the compiled model.
+pub(crate) fn geom_id(model: &MjModel, name: &str) -> Result<usize, SimError> {
+    let id = model.name_to_id(MjtObjBase::mjOBJ_GEOM, name);
+    id.ok_or_else(|| SimError::MissingGeom {
+        geom: name.to_owned(),
+    })
 }
 
 /// Tells whether poses of the goal joints touch themselves: geometry alone, legs in their default pose.

@@ -2,6 +2,8 @@
 
 use mujoco_rs::prelude::MjDataError;
 
+use crate::Divergence;
+
 /// Why a simulation could not be run to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
@@ -30,8 +32,8 @@ pub enum SimError {
     Diverged {
         /// Index of the frame.
         frame: usize,
-        /// MuJoCo's warning.
-        reason: &'static str,
+        /// What is wrong with it.
+        reason: Divergence,
     },
     /// A collision pair names a geom that the compiled model lacks.
     #[error("the model has no geom {geom:?}, which a collision pair names")]
@@ -39,6 +41,15 @@ pub enum SimError {
         /// Name of the geom.
         geom: String,
     },
+    /// The compiled model lacks a body that the robot names.
+    #[error("the model has no body {body:?}, which the robot names")]
+    MissingBody {
+        /// Name of the body.
+        body: String,
+    },
+    /// The system gave no threads for a pool.
+    #[error("cannot start threads for simulation: {0}")]
+    Threads(#[from] rayon::ThreadPoolBuildError),
     /// MuJoCo had no memory for the simulation.
     #[error("cannot make a simulation: {0}")]
     Data(#[from] MjDataError),

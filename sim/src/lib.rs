@@ -19,11 +19,17 @@
 //! Frames: x forward, y left, z up, origin at the pelvis. Units: metres, radians, seconds.
 
 mod collision;
+mod divergence;
 mod error;
+mod physics;
+mod pool;
 mod replay;
 #[cfg(test)]
 mod testing;
 
 pub use collision::SelfCollision;
+pub use divergence::Divergence;
 pub use error::SimError;
+pub use physics::{Body, BodyParameters, FootReading, Reading, SelfContact, Stage, Start, Targets};
+pub use pool::{Pool, Priority};
 pub use replay::{Replay, ReplayFrame, replay};

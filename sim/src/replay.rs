@@ -2,11 +2,10 @@
 
 use emp_robot::{FrameKinematics, Joint, KEY_NODES, Robot};
 use mujoco_rs::prelude::*;
-use mujoco_rs::wrappers::mj_statistic::MjWarningStat;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::SimError;
 use crate::collision::ContactPairs;
+use crate::{Divergence, SimError};
 
 /// The base hangs this far above its standing height, metres: the floor is out of reach.
 const LIFT: f64 = 1.0;
@@ -70,16 +69,16 @@ pub fn replay(robot: &Robot, targets: &[impl AsRef<[f32]>]) -> Result<Replay, Si
     for (frame, angles) in targets.iter().enumerate() {
         check_angles(robot, frame, angles.as_ref())?;
     }
-    let mut stage = Stage::new(robot)?;
+    let mut held = HeldRobot::new(robot)?;
     if let Some(first) = targets.first() {
-        stage.start(first.as_ref());
+        held.start(first.as_ref());
     }
     let mut frames = Vec::with_capacity(targets.len());
     for (frame, angles) in targets.iter().enumerate() {
-        frames.push(stage.play(frame, angles.as_ref())?);
+        frames.push(held.play(frame, angles.as_ref())?);
     }
     Ok(Replay {
-        saturated_share: stage.saturated_share(targets.len()),
+        saturated_share: held.saturated_share(targets.len()),
         frames,
     })
 }
@@ -128,7 +127,7 @@ fn hold_base(robot: &Robot, data: &mut MjData<Box<MjModel>>) {
 }
 
 /// A simulation of one robot with its pelvis held.
-struct Stage<'a> {
+struct HeldRobot<'a> {
     robot: &'a Robot,
     data: MjData<Box<MjModel>>,
     pairs: ContactPairs,
@@ -137,7 +136,7 @@ struct Stage<'a> {
     saturated: usize,
 }
 
-impl<'a> Stage<'a> {
+impl<'a> HeldRobot<'a> {
     fn new(robot: &'a Robot) -> Result<Self, SimError> {
         let mut model = Box::new(robot.model());
         model.dof_armature_mut()[..BASE_VELOCITY].fill(HOLDING_ARMATURE);
@@ -172,7 +171,7 @@ impl<'a> Stage<'a> {
         let mut self_collision = false;
         for _ in 0..self.robot.substeps() {
             self.data.step();
-            if let Some(reason) = first_warning(self.data.warning()) {
+            if let Some(reason) = Divergence::warned(self.data.warning(), 0) {
                 return Err(SimError::Diverged { frame, reason });
             }
             self_collision |= self.pairs.touch(self.data.contact());
@@ -217,24 +216,6 @@ impl<'a> Stage<'a> {
         let all = frames * self.robot.substeps() * self.robot.goal_joints().len();
         self.saturated as f64 / all.max(1) as f64
     }
-}
-
-/// The first thing that MuJoCo warned of, in words.
-fn first_warning(warnings: &[MjWarningStat]) -> Option<&'static str> {
-    const REASONS: [&str; 7] = [
-        "the inertia matrix is singular",
-        "there are more contacts than there is room for",
-        "there are more constraints than there is room for",
-        "a joint position is NaN, infinite or huge",
-        "a joint velocity is NaN, infinite or huge",
-        "a joint acceleration is NaN, infinite or huge",
-        "a control is NaN, infinite or huge",
-    ];
-    warnings
-        .iter()
-        .zip(REASONS)
-        .find(|(warning, _)| warning.number > 0)
-        .map(|(_, reason)| reason)
 }
 
 /// Where the points along one leg come from.
@@ -382,17 +363,17 @@ mod tests {
             let targets = [rest.clone(), far.clone(), rest, far];
             assert!(replay(robot, &targets).unwrap().saturated_share > 0.1);
 
-            let mut stage = Stage::new(robot).unwrap();
-            stage.start(&targets[0]);
+            let mut held = HeldRobot::new(robot).unwrap();
+            held.start(&targets[0]);
             for target in &targets {
-                stage.data.ctrl_mut()[..target.len()]
+                held.data.ctrl_mut()[..target.len()]
                     .copy_from_slice(&target.iter().map(|&a| f64::from(a)).collect::<Vec<_>>());
                 for _ in 0..robot.substeps() {
-                    stage.data.step();
+                    held.data.step();
                 }
             }
             let height = robot.standing_height() + LIFT;
-            let qpos = stage.data.qpos();
+            let qpos = held.data.qpos();
             let moved =
                 (Vector3::new(qpos[0], qpos[1], qpos[2]) - Vector3::new(0.0, 0.0, height)).norm();
             assert!(
@@ -465,11 +446,11 @@ mod tests {
     fn a_diverged_simulation_is_an_error_with_its_frame() {
         for_each_robot(|robot| {
             let rest = pose(robot, &[]);
-            let mut stage = Stage::new(robot).unwrap();
-            stage.start(&rest);
-            stage.play(0, &rest).unwrap();
-            stage.data.qvel_mut()[10] = f64::NAN;
-            let error = stage.play(1, &rest).unwrap_err().to_string();
+            let mut held = HeldRobot::new(robot).unwrap();
+            held.start(&rest);
+            held.play(0, &rest).unwrap();
+            held.data.qvel_mut()[10] = f64::NAN;
+            let error = held.play(1, &rest).unwrap_err().to_string();
             assert!(
                 error.contains("frame 1") && error.contains("velocity"),
                 "{error}"

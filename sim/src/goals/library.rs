@@ -1,0 +1,184 @@
+//! Many clips, to draw training goals from.
+
+use emp_robot::{JointMirror, Robot};
+use rand::{Rng, RngExt as _};
+
+use super::stream::Piece;
+use super::{GoalClip, GoalError, GoalStatistics, GoalStream, Source};
+
+/// Frames of a piece, as in the paper (section VI).
+pub(super) const PIECE: usize = 60;
+/// Frames for which a clip counts at most when one is drawn: a few long recordings of people who stand about do not
+/// fill the stream.
+const LARGEST_WEIGHT: usize = 1000;
+/// Mean speed of the faster hand below which a recording is slow, m/s.
+const SLOW: f64 = 0.2;
+/// Tempo of pieces of slow recordings (a person who drinks, seated, moves the hand at 0.07 m/s on average), and of others.
+const SLOW_TEMPO: [f32; 2] = [0.8, 2.5];
+const TEMPO: [f32; 2] = [0.8, 1.3];
+/// A piece's amplitude is at least this share of the stream's difficulty.
+const LEAST_AMPLITUDE: f32 = 0.5;
+
+/// Clips of one robot, from which [`GoalStream`]s draw. Immutable; share it in an [`Arc`](std::sync::Arc).
+#[derive(Debug)]
+pub struct GoalLibrary {
+    clips: Vec<Entry>,
+    /// Recorded and procedural clips, those of the two that there are; each is drawn from as often as the other.
+    groups: Vec<Group>,
+    pub(super) joints: Vec<Joint>,
+    /// Control period, seconds.
+    pub(super) period: f32,
+}
+
+/// What the stream has to know of a goal joint.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Joint {
+    pub(super) range: [f32; 2],
+    default: f32,
+    /// Whose angle it takes in the mirror, and with what sign.
+    partner: usize,
+    sign: f32,
+}
+
+#[derive(Debug)]
+struct Entry {
+    clip: GoalClip,
+    tempo: [f32; 2],
+}
+
+/// Clips of one source.
+#[derive(Debug)]
+struct Group {
+    /// Indices of the clips.
+    clips: Vec<usize>,
+    /// Weight of each clip and those before it.
+    cumulative: Vec<usize>,
+}
+
+impl GoalLibrary {
+    /// A library of `clips`.
+    ///
+    /// # Errors
+    /// If there is no clip, one has another number of joints than the robot, or the robot has no mirror image.
+    pub fn new(robot: &Robot, clips: Vec<GoalClip>) -> Result<Self, GoalError> {
+        let expected = robot.goal_joints().len();
+        if clips.is_empty() {
+            return Err(GoalError::NoClip);
+        }
+        if let Some(clip) = clips.iter().find(|clip| clip.joints() != expected) {
+            return Err(GoalError::Joints {
+                clip: clip.name.clone(),
+                expected,
+                found: clip.joints(),
+            });
+        }
+        let groups =
+            [Source::Recorded, Source::Procedural].map(|source| Group::new(&clips, source));
+        let tempo = |clip: &GoalClip| match clip.source {
+            Source::Recorded if is_slow(robot, clip) => SLOW_TEMPO,
+            _ => TEMPO,
+        };
+        Ok(Self {
+            groups: groups.into_iter().flatten().collect(),
+            joints: joints(robot, &robot.mirror()?),
+            period: (1.0 / robot.control_rate_hz()) as f32,
+            clips: clips
+                .into_iter()
+                .map(|clip| Entry {
+                    tempo: tempo(&clip),
+                    clip,
+                })
+                .collect(),
+        })
+    }
+
+    /// The clips.
+    pub fn clips(&self) -> impl ExactSizeIterator<Item = &GoalClip> {
+        self.clips.iter().map(|entry| &entry.clip)
+    }
+
+    /// Number of goal joints.
+    pub fn joints(&self) -> usize {
+        self.joints.len()
+    }
+
+    /// An endless stream of goals that follows from `seed`. `difficulty` is the largest amplitude of a piece: 1 is the
+    /// clips' own, 0 the default pose.
+    pub fn stream(&self, seed: u64, difficulty: f32) -> GoalStream {
+        GoalStream::new(self, seed, difficulty)
+    }
+
+    /// Draws a piece of a clip.
+    pub(super) fn draw(&self, rng: &mut impl Rng, difficulty: f32) -> Piece {
+        let group = &self.groups[rng.random_range(0..self.groups.len())];
+        let clip = group.draw(rng);
+        let Entry { clip: goals, tempo } = &self.clips[clip];
+        let tempo = rng.random_range(tempo[0]..=tempo[1]);
+        let last = (goals.len() - 1) as f64;
+        let frames = PIECE.min((last / f64::from(tempo)) as usize + 1);
+        let spare = last - (frames - 1) as f64 * f64::from(tempo);
+        Piece {
+            clip,
+            start: rng.random_range(0.0..=spare.max(0.0)),
+            tempo,
+            frames,
+            amplitude: difficulty * rng.random_range(LEAST_AMPLITUDE..=1.0),
+            mirrored: rng.random_bool(0.5),
+        }
+    }
+
+    /// The goal of frame `t` of a piece.
+    pub(super) fn goal(&self, piece: &Piece, t: usize, out: &mut [f32]) {
+        let clip = &self.clips[piece.clip].clip;
+        let at = piece.start + t as f64 * f64::from(piece.tempo);
+        if piece.mirrored {
+            clip.interpolate(at, |joint| self.joints[joint].partner, out);
+        } else {
+            clip.interpolate(at, |joint| joint, out);
+        }
+        for (out, joint) in out.iter_mut().zip(&self.joints) {
+            let sign = if piece.mirrored { joint.sign } else { 1.0 };
+            let offset = piece.amplitude * (sign * *out - joint.default);
+            *out = (joint.default + offset).clamp(joint.range[0], joint.range[1]);
+        }
+    }
+}
+
+impl Group {
+    /// The clips of `source`, none if there is none.
+    fn new(clips: &[GoalClip], source: Source) -> Option<Self> {
+        let indices = (0..clips.len()).filter(|&i| clips[i].source == source);
+        let clips_of: Vec<usize> = indices.collect();
+        let mut sum = 0;
+        let weigh = |&i: &usize| {
+            sum += clips[i].len().min(LARGEST_WEIGHT);
+            sum
+        };
+        let cumulative: Vec<usize> = clips_of.iter().map(weigh).collect();
+        (!clips_of.is_empty()).then_some(Self {
+            clips: clips_of,
+            cumulative,
+        })
+    }
+
+    fn draw(&self, rng: &mut impl Rng) -> usize {
+        let total = self.cumulative[self.cumulative.len() - 1];
+        let drawn = rng.random_range(0..total);
+        self.clips[self.cumulative.partition_point(|&sum| sum <= drawn)]
+    }
+}
+
+fn joints(robot: &Robot, mirror: &JointMirror) -> Vec<Joint> {
+    let goal = robot.goal_joints().iter().enumerate();
+    goal.map(|(i, joint)| Joint {
+        range: joint.range.map(|limit| limit as f32),
+        default: joint.default as f32,
+        partner: mirror.permutation()[i],
+        sign: mirror.signs()[i],
+    })
+    .collect()
+}
+
+fn is_slow(robot: &Robot, clip: &GoalClip) -> bool {
+    GoalStatistics::of(robot, [clip]).is_some_and(|statistics| statistics.hand_speed.mean < SLOW)
+}

@@ -1,0 +1,212 @@
+//! Endless goals for training.
+
+use rand::{Rng, RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::GoalLibrary;
+
+/// Peak joint speeds of the movement from one piece to the next, rad/s: from leisurely to brisk.
+const JOIN_SPEED: [f32; 2] = [1.0, 4.0];
+/// Frames of the shortest such movement.
+const SHORTEST_JOIN: usize = 15;
+/// Control periods in which the motion of the piece before fades, and that of the piece after is taken up.
+const FADE: f32 = (SHORTEST_JOIN + 1) as f32;
+/// Peak speed over mean speed of a minimum-jerk movement from rest to rest.
+const PEAK_TO_MEAN: f32 = 1.875;
+
+/// An endless sequence of goals: random pieces of clips of up to 60 frames, each mirrored or not, faster or slower,
+/// wider or narrower about the default pose, joined by minimum-jerk movements that keep position and velocity
+/// continuous and take as long as a person's joints need for the way (paper, section VI).
+///
+/// The stream is a few numbers: indices, a generator, and the ends of the movements between pieces. It is cheap to
+/// clone, a stored one goes on exactly, and every call needs the library that it was drawn from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct GoalStream {
+    rng: ChaCha8Rng,
+    difficulty: f32,
+    /// Frames of the current segment that were given.
+    given: usize,
+    current: Segment,
+    next: Segment,
+}
+
+/// A piece of a clip as it is played.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Piece {
+    /// Index of the clip in the library.
+    pub(super) clip: usize,
+    /// Where it starts in the clip, frames.
+    pub(super) start: f64,
+    /// Frames of the clip in one control period.
+    pub(super) tempo: f32,
+    /// Control periods, at least 1.
+    pub(super) frames: usize,
+    /// Factor on the distance from the default pose.
+    pub(super) amplitude: f32,
+    pub(super) mirrored: bool,
+}
+
+/// A movement to a piece, then the piece.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Segment {
+    join: Option<Join>,
+    piece: Piece,
+}
+
+/// A movement between two states of motion, both left out.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Join {
+    frames: usize,
+    from: State,
+    to: State,
+}
+
+/// Goal angles, rad, and their velocities, rad a control period.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct State {
+    position: Vec<f32>,
+    velocity: Vec<f32>,
+}
+
+impl GoalStream {
+    pub(super) fn new(library: &GoalLibrary, seed: u64, difficulty: f32) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let current = Segment {
+            join: None,
+            piece: library.draw(&mut rng, difficulty),
+        };
+        Self {
+            next: Segment::after(&current.piece, library, difficulty, &mut rng),
+            rng,
+            difficulty,
+            given: 0,
+            current,
+        }
+    }
+
+    /// Gives the next goal: one angle for each goal joint, rad, inside its range.
+    ///
+    /// # Panics
+    /// If the stream was drawn from another library.
+    pub fn next(&mut self, library: &GoalLibrary, goal: &mut [f32]) {
+        if self.given == self.current.frames() {
+            let after = Segment::after(&self.next.piece, library, self.difficulty, &mut self.rng);
+            self.current = std::mem::replace(&mut self.next, after);
+            self.given = 0;
+        }
+        self.current.goal(library, self.given, goal);
+        self.given += 1;
+    }
+
+    /// The goal `ahead` frames after the one that [`next`](Self::next) gave last: 1 is what it gives next. Before the
+    /// first call, 0 is the first goal too. Looks no further than the end of the next piece, at least 16 frames away.
+    ///
+    /// # Panics
+    /// If the stream was drawn from another library.
+    pub fn peek(&self, library: &GoalLibrary, ahead: usize, goal: &mut [f32]) {
+        let t = (self.given + ahead).saturating_sub(1);
+        match t.checked_sub(self.current.frames()) {
+            None => self.current.goal(library, t, goal),
+            Some(t) => self.next.goal(library, t.min(self.next.frames() - 1), goal),
+        }
+    }
+
+    /// The largest amplitude of the pieces.
+    pub fn difficulty(&self) -> f32 {
+        self.difficulty
+    }
+
+    /// Sets the largest amplitude of the pieces that are not drawn yet: those after the next one.
+    pub fn set_difficulty(&mut self, difficulty: f32) {
+        self.difficulty = difficulty;
+    }
+}
+
+impl Segment {
+    /// Draws what follows a piece.
+    fn after(before: &Piece, library: &GoalLibrary, difficulty: f32, rng: &mut impl Rng) -> Self {
+        let piece = library.draw(rng, difficulty);
+        let speed = rng.random_range(JOIN_SPEED[0]..=JOIN_SPEED[1]);
+        Self {
+            join: Some(Join::new(library, before, &piece, speed)),
+            piece,
+        }
+    }
+
+    fn frames(&self) -> usize {
+        self.join.as_ref().map_or(0, |join| join.frames) + self.piece.frames
+    }
+
+    fn goal(&self, library: &GoalLibrary, t: usize, goal: &mut [f32]) {
+        match &self.join {
+            Some(join) if t < join.frames => join.goal(library, t, goal),
+            Some(join) => library.goal(&self.piece, t - join.frames, goal),
+            None => library.goal(&self.piece, t, goal),
+        }
+    }
+}
+
+impl Join {
+    /// The movement from the end of one piece to the start of another, with a peak speed of about `speed` rad/s.
+    fn new(library: &GoalLibrary, from: &Piece, to: &Piece, speed: f32) -> Self {
+        let last = from.frames - 1;
+        let from = State::new(library, from, last, [last.saturating_sub(1), last]);
+        let to = State::new(library, to, 0, [0, 1.min(to.frames - 1)]);
+        let ways = from.moved(faded(1.0)).zip(to.moved(-faded(1.0)));
+        let farthest = ways.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let frames = PEAK_TO_MEAN * farthest / (speed * library.period);
+        Self {
+            frames: SHORTEST_JOIN.max(frames.ceil() as usize),
+            from,
+            to,
+        }
+    }
+
+    /// Goal `t` of the movement: from the fading motion before, by a minimum-jerk weight, to the growing motion after.
+    fn goal(&self, library: &GoalLibrary, t: usize, goal: &mut [f32]) {
+        let (passed, left) = ((t + 1) as f32, (self.frames - t) as f32);
+        let weight = minimum_jerk(passed / (passed + left));
+        let from = self.from.moved(faded(passed / FADE));
+        let to = self.to.moved(-faded(left / FADE));
+        for (((goal, joint), from), to) in goal.iter_mut().zip(&library.joints).zip(from).zip(to) {
+            let angle = from + weight * (to - from);
+            *goal = angle.clamp(joint.range[0], joint.range[1]);
+        }
+    }
+}
+
+impl State {
+    /// Position of frame `t` of a piece, velocity between two neighbouring frames.
+    fn new(library: &GoalLibrary, piece: &Piece, t: usize, between: [usize; 2]) -> Self {
+        let goal = |t: usize| {
+            let mut goal = vec![0.0; library.joints()];
+            library.goal(piece, t, &mut goal);
+            goal
+        };
+        let [before, after] = between.map(goal);
+        let velocity = before.iter().zip(&after).map(|(a, b)| b - a);
+        Self {
+            position: goal(t),
+            velocity: velocity.collect(),
+        }
+    }
+
+    /// The position after so many control periods at this velocity.
+    fn moved(&self, periods: f32) -> impl Iterator<Item = f32> {
+        let joints = self.position.iter().zip(&self.velocity);
+        joints.map(move |(position, velocity)| position + periods * velocity)
+    }
+}
+
+/// Share of the way from one point to another at time `s` in 0..1: no velocity and no acceleration at either end.
+fn minimum_jerk(s: f32) -> f32 {
+    s * s * s * (10.0 + s * (6.0 * s - 15.0))
+}
+
+/// Control periods' worth of its first velocity that a motion covers while it comes to rest smoothly over [`FADE`],
+/// at time `s` of it; half of [`FADE`] from 1 on.
+fn faded(s: f32) -> f32 {
+    let s = s.min(1.0);
+    FADE * (s - s * s * s * (1.0 - 0.5 * s))
+}

@@ -1,0 +1,268 @@
+use emp_robot::Robot;
+
+use super::*;
+use crate::testing::{for_each_robot, pose};
+
+/// A swing of all joints about the default pose, rad at `hz`.
+fn swing(robot: &Robot, source: Source, frames: usize, amplitude: f64, hz: f64) -> GoalClip {
+    let rows: Vec<Vec<f32>> = (0..frames)
+        .map(|t| {
+            let phase = |j: usize| t as f64 / 50.0 * hz * std::f64::consts::TAU + j as f64;
+            let rest = pose(robot, &[]);
+            let angle = |(j, rest): (usize, f32)| rest + (amplitude * phase(j).sin()) as f32;
+            rest.into_iter().enumerate().map(angle).collect()
+        })
+        .collect();
+    GoalClip::new(robot, format!("swing-{hz}"), source, &rows).unwrap()
+}
+
+fn library(robot: &Robot) -> GoalLibrary {
+    let clips = vec![
+        swing(robot, Source::Recorded, 300, 0.4, 0.05),
+        swing(robot, Source::Recorded, 200, 0.3, 0.8),
+        swing(robot, Source::Procedural, 30, 0.5, 0.5),
+        swing(robot, Source::Procedural, 500, 0.6, 0.7),
+    ];
+    GoalLibrary::new(robot, clips).unwrap()
+}
+
+fn take(library: &GoalLibrary, stream: &mut GoalStream, frames: usize) -> Vec<Vec<f32>> {
+    (0..frames)
+        .map(|_| {
+            let mut goal = vec![0.0; library.joints()];
+            stream.next(library, &mut goal);
+            goal
+        })
+        .collect()
+}
+
+fn fastest(robot: &Robot, goals: &[Vec<f32>]) -> f32 {
+    let steps = goals
+        .windows(2)
+        .flat_map(|pair| pair[0].iter().zip(&pair[1]));
+    let step = steps.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    step * robot.control_rate_hz() as f32
+}
+
+#[test]
+fn the_seed_decides_and_a_stored_stream_goes_on() {
+    for_each_robot(|robot| {
+        let library = library(robot);
+        let [mut first, mut second, mut other] = [7, 7, 8].map(|seed| library.stream(seed, 1.0));
+        let goals = take(&library, &mut first, 500);
+        assert_eq!(goals, take(&library, &mut second, 500));
+        assert_ne!(goals, take(&library, &mut other, 500));
+        let stored = postcard::to_stdvec(&first).unwrap();
+        let mut restored: GoalStream = postcard::from_bytes(&stored).unwrap();
+        assert_eq!(
+            take(&library, &mut first, 500),
+            take(&library, &mut restored, 500)
+        );
+    });
+}
+
+#[test]
+fn what_is_seen_ahead_comes() {
+    for_each_robot(|robot| {
+        let library = library(robot);
+        let goals = take(&library, &mut library.stream(3, 1.0), 1010);
+        let mut stream = library.stream(3, 1.0);
+        let mut seen = vec![0.0; library.joints()];
+        stream.peek(&library, 0, &mut seen);
+        assert_eq!(seen, goals[0]);
+        for t in 0..1000 {
+            take(&library, &mut stream, 1);
+            for ahead in [0, 1, 5, 10] {
+                stream.peek(&library, ahead, &mut seen);
+                assert_eq!(seen, goals[t + ahead], "{ahead} ahead of {t}");
+            }
+        }
+    });
+}
+
+#[test]
+fn goals_stay_in_range_and_pieces_are_joined_at_human_speed() {
+    for_each_robot(|robot| {
+        let library = library(robot);
+        for (seed, difficulty) in [(0, 0.3), (1, 1.0), (2, 1.6)] {
+            let goals = take(&library, &mut library.stream(seed, difficulty), 5000);
+            for (angle, joint) in goals
+                .iter()
+                .flat_map(|goal| goal.iter().zip(robot.goal_joints()))
+            {
+                let range = joint.range.map(|limit| limit as f32);
+                assert!(
+                    (range[0]..=range[1]).contains(angle),
+                    "{}: {angle}",
+                    joint.name
+                );
+            }
+            // Pieces: at most 0.6 rad at 0.7 Hz × 1.3. Joins: a peak of 4 rad/s, and the ends' own speeds.
+            let pieces = 0.6 * 0.7 * 1.3 * std::f32::consts::TAU * difficulty;
+            let speed = fastest(robot, &goals);
+            assert!(speed < 4.0 + pieces, "{}: {speed} rad/s", robot.name());
+            // Velocity is continuous: a change of 2 rad/s within a frame would be 100 rad/s².
+            let steps = goals.windows(3).flat_map(|w| {
+                (0..w[0].len()).map(|j| 50.0 * (w[2][j] - 2.0 * w[1][j] + w[0][j]).abs())
+            });
+            let unclamped = difficulty <= 1.0;
+            assert!(
+                !unclamped || steps.fold(0.0, f32::max) < 2.0,
+                "{}",
+                robot.name()
+            );
+        }
+    });
+}
+
+#[test]
+fn difficulty_is_the_largest_amplitude() {
+    for_each_robot(|robot| {
+        let library = library(robot);
+        let rest = pose(robot, &[]);
+        let farthest = |difficulty: f32| {
+            let goals = take(&library, &mut library.stream(5, difficulty), 3000);
+            let offsets = goals.iter().flat_map(|goal| goal.iter().zip(&rest));
+            offsets.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+        };
+        assert!(farthest(0.0) < 1e-6);
+        let (half, full) = (farthest(0.5), farthest(1.0));
+        // A piece that ends at full speed needs a few frames more to stop.
+        assert!((0.25..0.5).contains(&half), "{}: {half}", robot.name());
+        assert!((0.5..1.0).contains(&full), "{}: {full}", robot.name());
+        let mut stream = library.stream(5, 1.0);
+        stream.set_difficulty(0.0);
+        take(&library, &mut stream, 1000);
+        assert_eq!(take(&library, &mut stream, 1)[0], rest);
+    });
+}
+
+#[test]
+fn recorded_and_procedural_pieces_are_drawn_half_and_half_and_slow_ones_sped_up() {
+    for_each_robot(|robot| {
+        let library = library(robot);
+        let mut rng = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(1);
+        let pieces: Vec<_> = (0..2000).map(|_| library.draw(&mut rng, 1.0)).collect();
+        let share = |of: &dyn Fn(usize) -> bool| {
+            pieces.iter().filter(|piece| of(piece.clip)).count() as f64 / 2000.0
+        };
+        assert!((share(&|clip| clip < 2) - 0.5).abs() < 0.05);
+        // 300 to 200 frames.
+        assert!((share(&|clip| clip == 0) - 0.3).abs() < 0.05);
+        for piece in &pieces {
+            let tempo = if piece.clip == 0 {
+                0.8..=2.5
+            } else {
+                0.8..=1.3
+            };
+            assert!(tempo.contains(&piece.tempo));
+            let end = piece.start + (piece.frames - 1) as f64 * f64::from(piece.tempo);
+            let clip = library.clips().nth(piece.clip).unwrap();
+            assert!(end <= (clip.len() - 1) as f64 + 1e-3, "{piece:?}");
+            assert!(piece.frames == 60 || piece.clip == 2, "{piece:?}");
+        }
+        assert!(pieces.iter().any(|piece| piece.tempo > 2.2));
+        let mirrored = pieces.iter().filter(|piece| piece.mirrored).count();
+        assert!((900..1100).contains(&mirrored));
+    });
+}
+
+#[test]
+fn a_mirrored_piece_is_the_mirrored_clip() {
+    for_each_robot(|robot| {
+        let clip = swing(robot, Source::Recorded, 100, 0.3, 0.5);
+        let image = clip.mirrored(&robot.mirror().unwrap());
+        let library = GoalLibrary::new(robot, vec![clip]).unwrap();
+        let piece = stream::Piece {
+            clip: 0,
+            start: 10.0,
+            tempo: 1.0,
+            frames: 60,
+            amplitude: 1.0,
+            mirrored: true,
+        };
+        let mut goal = vec![0.0; library.joints()];
+        for t in 0..60 {
+            library.goal(&piece, t, &mut goal);
+            for (a, b) in goal.iter().zip(image.frame(10 + t)) {
+                assert!((a - b).abs() < 1e-3);
+            }
+        }
+    });
+}
+
+#[test]
+fn windows_drop_the_remainder_but_keep_a_short_clip_whole() {
+    for_each_robot(|robot| {
+        let lengths = |frames: usize| -> Vec<(String, usize)> {
+            let clip = swing(robot, Source::Recorded, frames, 0.1, 1.0);
+            let windows = clip.windows(200);
+            windows.iter().map(|w| (w.name.clone(), w.len())).collect()
+        };
+        let named = |names: &[&str]| -> Vec<(String, usize)> {
+            names.iter().map(|name| ((*name).to_owned(), 200)).collect()
+        };
+        assert_eq!(lengths(599), named(&["swing-1@0", "swing-1@200"]));
+        assert_eq!(lengths(399), named(&["swing-1"]));
+        assert_eq!(lengths(199), [("swing-1".to_owned(), 199)]);
+        assert_eq!(lengths(60), [("swing-1".to_owned(), 60)]);
+        assert!(lengths(59).is_empty());
+        let clip = swing(robot, Source::Recorded, 599, 0.1, 1.0);
+        assert_eq!(clip.windows(200)[1].frame(7), clip.frame(207));
+    });
+}
+
+#[test]
+fn speed_and_amplitude_scale_what_they_say() {
+    for_each_robot(|robot| {
+        let clip = swing(robot, Source::Procedural, 201, 0.2, 0.5);
+        let fast = clip.at_speed(robot, 1.6);
+        assert_eq!((fast.len(), clip.at_speed(robot, 0.5).len()), (126, 401));
+        assert_eq!(clip.at_speed(robot, 1.0), clip);
+        for (a, b) in fast.frame(5).iter().zip(clip.frame(8)) {
+            assert!((a - b).abs() < 1e-6);
+        }
+        let of = |clip: &GoalClip| GoalStatistics::of(robot, [clip]).unwrap();
+        let ratio = of(&fast).joint_speed.mean / of(&clip).joint_speed.mean;
+        assert!((ratio - 1.6).abs() < 0.02, "{ratio}");
+
+        let wide = clip.scaled_amplitude(robot, 1.5);
+        let ratio = of(&wide).amplitude.mean / of(&clip).amplitude.mean;
+        assert!((ratio - 1.5).abs() < 0.02, "{ratio}");
+        // 0.2 rad at 0.5 Hz: the fastest joint moves at about 0.2 · π rad/s.
+        let statistics = of(&clip);
+        assert!(
+            (statistics.joint_speed.p95 - 0.628).abs() < 0.02,
+            "{statistics:?}"
+        );
+        assert!(
+            (statistics.amplitude.p95 - 0.2).abs() < 0.01,
+            "{statistics:?}"
+        );
+        assert_eq!(statistics.frames, 201);
+        let far = clip.scaled_amplitude(robot, 100.0);
+        for (angle, joint) in far.frame(30).iter().zip(robot.goal_joints()) {
+            assert!((joint.range[0] as f32..=joint.range[1] as f32).contains(angle));
+        }
+    });
+}
+
+#[test]
+fn what_is_no_goal_is_refused_by_clip_and_frame() {
+    for_each_robot(|robot| {
+        let new = |rows: &[Vec<f32>]| {
+            GoalClip::new(robot, "wave", Source::Recorded, rows).map_err(|error| error.to_string())
+        };
+        assert!(new(&[]).unwrap_err().contains("wave"));
+        let good = pose(robot, &[]);
+        let mut bad = good.clone();
+        bad[2] = f32::NAN;
+        let error = new(&[good.clone(), bad]).unwrap_err();
+        assert!(
+            error.contains("wave") && error.contains("frame 1"),
+            "{error}"
+        );
+        assert!(new(&[good, vec![0.0; 3]]).unwrap_err().contains("frame 1"));
+        assert!(GoalLibrary::new(robot, Vec::new()).is_err());
+    });
+}

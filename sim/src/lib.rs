@@ -21,6 +21,7 @@
 mod collision;
 mod divergence;
 mod error;
+pub mod goals;
 mod physics;
 mod pool;
 mod replay;

@@ -6,30 +6,46 @@ use std::{
     sync::Arc,
 };
 
-use emp_models::retarget::{RetargetInput, RetargetOutput, Retargeter};
-use emp_proto::v1;
+use emp_models::{
+    controller::Controller,
+    policy::Policy,
+    retarget::{RetargetInput, RetargetOutput, Retargeter},
+};
+use emp_proto::v1::{self, ModelKind};
 use emp_robot::{Robot, RobotError, robot_folders};
 
 use crate::{
-    backend::{BackendError, BuildRetargeter, RetargetBackend, retargeter_from},
-    batcher::{Batcher, Limits},
+    backend::{
+        BackendError, Build, PolicyInput, PolicyOutput, first_then, policy_from, retargeter_from,
+    },
+    batcher::{Batcher, Limits, ModelState},
     error::ServiceError,
     settings::{BatchingSettings, Settings},
     wire,
 };
+use tokio::sync::watch;
 
-/// A retargeting model behind its queue.
-pub(crate) struct RetargetModel {
+/// A model behind its queue.
+pub(crate) struct Served<I, O, M> {
     pub(crate) card: v1::Model,
     pub(crate) robot: Arc<Robot>,
-    pub(crate) batcher: Batcher<RetargetInput, RetargetOutput>,
+    pub(crate) batcher: Batcher<I, O>,
+    /// The model itself, for jobs, which compute on threads of their own.
+    pub(crate) model: M,
 }
+
+/// A retargeting model; the network itself where it is the shipped one.
+pub(crate) type RetargetModel = Served<RetargetInput, RetargetOutput, Option<Arc<Retargeter>>>;
+
+/// A policy.
+pub(crate) type PolicyModel = Served<PolicyInput, PolicyOutput, Controller>;
 
 /// Everything that is served, by name.
 #[derive(Default)]
 pub struct Catalog {
     robots: BTreeMap<String, Arc<Robot>>,
     retargeters: BTreeMap<String, Arc<RetargetModel>>,
+    policies: BTreeMap<String, Arc<PolicyModel>>,
 }
 
 /// Why there is nothing to serve.
@@ -69,7 +85,7 @@ pub enum CatalogError {
 }
 
 impl Catalog {
-    /// Loads every robot whose weights are there; logs what it skips and why.
+    /// Loads every robot that has weights, with each model whose weights are there; logs what it skips and why.
     ///
     /// # Errors
     /// When the folders cannot be found or read, or nothing is left to serve.
@@ -84,40 +100,80 @@ impl Catalog {
                     continue;
                 }
             };
-            let file = weights.join(format!("{}-retargeter.safetensors", robot.name()));
-            match catalog.load_retargeter(&file, &robot, &settings.batching) {
-                Ok(()) => {
-                    tracing::info!(robot = robot.name(), weights = %file.display(), "robot served");
-                }
-                Err(error) => tracing::warn!(robot = robot.name(), %error, "robot skipped"),
-            }
+            catalog.load_models(&weights, &robot, &settings.batching);
         }
-        if catalog.retargeters.is_empty() {
+        if catalog.robots.is_empty() {
             return Err(CatalogError::Empty { robots, weights });
         }
         Ok(catalog)
     }
 
+    /// Loads a robot's models, each on its own: one whose weights are not there is not served.
+    fn load_models(&mut self, weights: &Path, robot: &Arc<Robot>, batching: &BatchingSettings) {
+        let file = |model: &str| weights.join(format!("{}-{model}.safetensors", robot.name()));
+        let loaded = [
+            (
+                "retargeter",
+                self.load_retargeter(file("retargeter"), robot, batching),
+            ),
+            ("policy", self.load_policy(file("policy"), robot, batching)),
+        ];
+        for (model, loaded) in loaded {
+            let weights = file(model);
+            match loaded {
+                Ok(()) => {
+                    tracing::info!(robot = robot.name(), weights = %weights.display(), "model served");
+                }
+                Err(error) => tracing::warn!(robot = robot.name(), %error, "not served"),
+            }
+        }
+    }
+
     fn load_retargeter(
         &mut self,
-        weights: &Path,
+        weights: PathBuf,
         robot: &Arc<Robot>,
         batching: &BatchingSettings,
     ) -> Result<(), CatalogError> {
         let name = format!("{}-retargeter", robot.name());
-        let loaded =
-            Retargeter::load(weights, Arc::clone(robot)).map_err(|error| CatalogError::Model {
-                name: name.clone(),
-                reason: BackendError::new(error.to_string()),
-            })?;
-        let card = wire::model_card(name, loaded.metadata());
-        let mut first = Some(loaded);
-        let mut again = retargeter_from(weights.to_owned(), Arc::clone(robot));
-        let build = move || match first.take() {
-            Some(loaded) => Ok(Box::new(loaded) as RetargetBackend),
-            None => again(),
-        };
-        self.add_retargeter(card, Arc::clone(robot), batching, Box::new(build))
+        let model = Retargeter::load(&weights, Arc::clone(robot))
+            .map(Arc::new)
+            .map_err(failed(&name))?;
+        let card = wire::model_card(
+            name,
+            ModelKind::Retargeter,
+            robot.goal_joints(),
+            model.metadata(),
+        );
+        let again = retargeter_from(weights, Arc::clone(robot));
+        let build = first_then(Arc::clone(&model), again);
+        let served = serve(card, robot, batching, build, Some(model))?;
+        self.insert_retargeter(served);
+        Ok(())
+    }
+
+    fn load_policy(
+        &mut self,
+        weights: PathBuf,
+        robot: &Arc<Robot>,
+        batching: &BatchingSettings,
+    ) -> Result<(), CatalogError> {
+        let name = format!("{}-policy", robot.name());
+        let policy = Policy::load(&weights, Arc::clone(robot)).map_err(failed(&name))?;
+        let card = wire::model_card(
+            name,
+            ModelKind::Policy,
+            robot.leg_joints(),
+            policy.metadata(),
+        );
+        let controller = Controller::new(Arc::new(policy), None);
+        let build = first_then(controller.clone(), policy_from(weights, Arc::clone(robot)));
+        let served = serve(card, robot, batching, build, controller)?;
+        self.robots
+            .insert(robot.name().to_owned(), Arc::clone(robot));
+        self.policies
+            .insert(served.card.name.clone(), Arc::new(served));
+        Ok(())
     }
 
     /// Adds a retargeting model for a robot and starts its thread.
@@ -127,78 +183,84 @@ impl Catalog {
     pub fn add_retargeter(
         &mut self,
         card: v1::Model,
-        robot: Arc<Robot>,
+        robot: &Arc<Robot>,
         batching: &BatchingSettings,
-        build: BuildRetargeter,
+        build: Build<RetargetInput, RetargetOutput>,
     ) -> Result<(), CatalogError> {
-        let limits = Limits {
-            max_batch: batching.max_batch.get(),
-            queue: batching.queue.get(),
-        };
-        let batcher =
-            Batcher::start(&card.name, limits, build).map_err(|reason| CatalogError::Model {
-                name: card.name.clone(),
-                reason,
-            })?;
-        self.robots
-            .insert(robot.name().to_owned(), Arc::clone(&robot));
-        self.retargeters.insert(
-            card.name.clone(),
-            Arc::new(RetargetModel {
-                card,
-                robot,
-                batcher,
-            }),
-        );
+        let served = serve(card, robot, batching, build, None)?;
+        self.insert_retargeter(served);
         Ok(())
     }
 
-    pub(crate) fn retargeters(&self) -> impl Iterator<Item = &Arc<RetargetModel>> {
-        self.retargeters.values()
+    fn insert_retargeter(&mut self, served: RetargetModel) {
+        self.robots
+            .insert(served.robot.name().to_owned(), Arc::clone(&served.robot));
+        self.retargeters
+            .insert(served.card.name.clone(), Arc::new(served));
     }
 
-    /// The model that a request or a stream's config asks for. Empty `model` and `version` take what there is.
+    /// The cards of every model, by name.
+    pub(crate) fn cards(&self) -> Vec<&v1::Model> {
+        let retargeters = self.retargeters.values().map(|model| &model.card);
+        let policies = self.policies.values().map(|model| &model.card);
+        let mut cards: Vec<_> = retargeters.chain(policies).collect();
+        cards.sort_by(|a, b| a.name.cmp(&b.name));
+        cards
+    }
+
+    /// The state of every model's thread, with the model's name.
+    pub(crate) fn states(&self) -> Vec<(String, watch::Receiver<ModelState>)> {
+        let retargeters = self.retargeters.values();
+        let retargeters = retargeters.map(|model| (model.card.name.clone(), model.batcher.state()));
+        let policies = self.policies.values();
+        let policies = policies.map(|model| (model.card.name.clone(), model.batcher.state()));
+        retargeters.chain(policies).collect()
+    }
+
+    /// The retargeter that a request or a stream's config asks for. Empty `model` and `version` take what there is.
     pub(crate) fn retargeter_for(
         &self,
         robot: &str,
         model: &str,
         version: &str,
     ) -> Result<&Arc<RetargetModel>, ServiceError> {
-        let of_robot = || {
-            self.retargeters()
-                .filter(|candidate| candidate.card.robot == robot)
-        };
-        if of_robot().next().is_none() {
-            let served = names(self.robots.keys());
-            return Err(not_served("robot", "robot", robot, served));
+        self.check_robot(robot)?;
+        choose(
+            &self.retargeters,
+            "robot with a retargeter",
+            robot,
+            model,
+            version,
+        )
+    }
+
+    /// The policy that a request or a stream's config asks for. Empty `model` and `version` take what there is.
+    pub(crate) fn policy_for(
+        &self,
+        robot: &str,
+        model: &str,
+        version: &str,
+    ) -> Result<&Arc<PolicyModel>, ServiceError> {
+        self.check_robot(robot)?;
+        choose(&self.policies, "robot with a policy", robot, model, version)
+    }
+
+    fn check_robot(&self, robot: &str) -> Result<(), ServiceError> {
+        if self.robots.contains_key(robot) {
+            return Ok(());
         }
-        let chosen = of_robot()
-            .find(|candidate| model.is_empty() || candidate.card.name == model)
-            .ok_or_else(|| {
-                let served = names(of_robot().map(|candidate| &candidate.card.name));
-                not_served("model", "model of this robot", model, served)
-            })?;
-        if !version.is_empty() && chosen.card.version != version {
-            let served = chosen.card.version.clone();
-            return Err(not_served(
-                "model_version",
-                "version of this model",
-                version,
-                served,
-            ));
-        }
-        Ok(chosen)
+        let served = names(self.robots.keys());
+        Err(not_served("robot", "robot", robot, served))
     }
 
     pub(crate) fn model(&self, name: &str) -> Result<&v1::Model, ServiceError> {
-        self.retargeters
-            .get(name)
-            .map(|model| &model.card)
-            .ok_or_else(|| ServiceError::NotFound {
-                what: "model",
-                name: name.to_owned(),
-                served: names(self.retargeters.keys()),
-            })
+        let cards = self.cards();
+        let found = cards.iter().find(|card| card.name == name);
+        found.copied().ok_or_else(|| ServiceError::NotFound {
+            what: "model",
+            name: name.to_owned(),
+            served: names(cards.iter().map(|card| &card.name)),
+        })
     }
 
     pub(crate) fn robot(&self, name: &str) -> Result<&Arc<Robot>, ServiceError> {
@@ -208,6 +270,69 @@ impl Catalog {
             served: names(self.robots.keys()),
         })
     }
+}
+
+/// Starts a model's thread.
+fn serve<I: Send + 'static, O: Send + 'static, M>(
+    card: v1::Model,
+    robot: &Arc<Robot>,
+    batching: &BatchingSettings,
+    build: Build<I, O>,
+    model: M,
+) -> Result<Served<I, O, M>, CatalogError> {
+    let limits = Limits {
+        max_batch: batching.max_batch.get(),
+        queue: batching.queue.get(),
+    };
+    let batcher = Batcher::start(&card.name, limits, build).map_err(failed(&card.name))?;
+    Ok(Served {
+        card,
+        robot: Arc::clone(robot),
+        batcher,
+        model,
+    })
+}
+
+fn failed<E: Into<BackendError>>(name: &str) -> impl Fn(E) -> CatalogError {
+    move |reason| CatalogError::Model {
+        name: name.to_owned(),
+        reason: reason.into(),
+    }
+}
+
+/// The model of one kind that a request asks for.
+fn choose<'a, I, O, M>(
+    models: &'a BTreeMap<String, Arc<Served<I, O, M>>>,
+    what: &'static str,
+    robot: &str,
+    model: &str,
+    version: &str,
+) -> Result<&'a Arc<Served<I, O, M>>, ServiceError> {
+    let of_robot = || {
+        models
+            .values()
+            .filter(|candidate| candidate.card.robot == robot)
+    };
+    if of_robot().next().is_none() {
+        let served = names(models.values().map(|candidate| &candidate.card.robot));
+        return Err(not_served("robot", what, robot, served));
+    }
+    let chosen = of_robot()
+        .find(|candidate| model.is_empty() || candidate.card.name == model)
+        .ok_or_else(|| {
+            let served = names(of_robot().map(|candidate| &candidate.card.name));
+            not_served("model", "model of this robot", model, served)
+        })?;
+    if !version.is_empty() && chosen.card.version != version {
+        let served = chosen.card.version.clone();
+        return Err(not_served(
+            "model_version",
+            "version of this model",
+            version,
+            served,
+        ));
+    }
+    Ok(chosen)
 }
 
 fn not_served(field: &'static str, what: &'static str, name: &str, served: String) -> ServiceError {

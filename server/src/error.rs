@@ -29,6 +29,17 @@ impl FieldError {
             description: description.into(),
         }
     }
+
+    pub(crate) fn missing_config() -> Self {
+        Self::new(
+            "config",
+            "it is missing; a stream's first message is its config",
+        )
+    }
+
+    pub(crate) fn second_config() -> Self {
+        Self::new("config", "only the first message may be a config")
+    }
 }
 
 /// Why a call failed.

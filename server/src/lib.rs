@@ -1,7 +1,7 @@
-//! The gRPC server: it takes human poses off the wire, brings them to the models in batches, and sends joint targets
-//! back.
+//! The gRPC server: it takes human poses and robot states off the wire, brings them to the models in batches, and sends
+//! joint targets back.
 //!
-//! Transport (`service`, `session`) knows messages and deadlines; the core (`batcher`, `queue`) knows neither; a model
+//! Transport (`motion`, `models`, `session`) knows messages and deadlines; the core (`batcher`, `queue`) knows neither; a model
 //! is known only through [`Backend`]. Statuses are made in `error` and nowhere else. This crate never computes a joint
 //! angle itself, and it runs no model and no foreign code on a tokio thread.
 
@@ -10,17 +10,20 @@
 mod backend;
 mod batcher;
 mod catalog;
+mod check;
 mod deadline;
 mod error;
+mod models;
+mod motion;
 mod pose;
 mod queue;
+mod robot_state;
 mod serve;
-mod service;
 mod session;
 mod settings;
 mod wire;
 
-pub use backend::{Backend, BackendError, BuildRetargeter, RetargetBackend};
+pub use backend::{Backend, BackendError, BoxedBackend, Build, RetargetBackend};
 pub use catalog::{Catalog, CatalogError};
 pub use serve::{Drain, ServeError, Server};
 pub use settings::{

@@ -2,12 +2,9 @@
 
 use emp_motion::{FrameError, KEY_NODES, KeyNode, KeyNodeFrame};
 use emp_proto::v1::{HumanPose, Position, Quaternion};
-use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Rotation3, Vector3};
 
-use crate::error::FieldError;
-
-/// How far a quaternion's length may be from 1.
-const QUATERNION_TOLERANCE: f32 = 0.01;
+use crate::{check, error::FieldError};
 
 /// Reads a pose and moves its origin to the waist. Field paths start at the message that holds `pose`.
 pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError> {
@@ -67,7 +64,7 @@ fn path(name: &str) -> String {
 
 fn read_position(name: &str, position: &Position) -> Result<Vector3<f32>, FieldError> {
     let Position { x, y, z } = *position;
-    check_finite(name, [("x", x), ("y", y), ("z", z)])?;
+    check::finite(&path(name), [("x", x), ("y", y), ("z", z)])?;
     Ok(Vector3::new(x, y, z))
 }
 
@@ -75,31 +72,10 @@ fn read_rotation(
     name: &str,
     quaternion: Option<&Quaternion>,
 ) -> Result<Option<Rotation3<f32>>, FieldError> {
-    let Some(&Quaternion { w, x, y, z }) = quaternion else {
-        return Ok(None);
-    };
-    check_finite(name, [("w", w), ("x", x), ("y", y), ("z", z)])?;
-    let quaternion = nalgebra::Quaternion::new(w, x, y, z);
-    let length = quaternion.norm();
-    if (length - 1.0).abs() > QUATERNION_TOLERANCE {
-        return Err(FieldError::new(
-            path(name),
-            format!("a quaternion of length {length}; expected length 1"),
-        ));
-    }
-    Ok(Some(
-        UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix(),
-    ))
-}
-
-fn check_finite<const N: usize>(name: &str, values: [(&str, f32); N]) -> Result<(), FieldError> {
-    match values.into_iter().find(|(_, value)| !value.is_finite()) {
-        Some((axis, value)) => Err(FieldError::new(
-            format!("{}.{axis}", path(name)),
-            format!("{value}; expected a finite number"),
-        )),
-        None => Ok(()),
-    }
+    quaternion
+        .map(|quaternion| check::rotation(&path(name), quaternion))
+        .transpose()
+        .map(|rotation| rotation.map(|rotation| rotation.cast().to_rotation_matrix()))
 }
 
 fn field_of(error: &FrameError) -> String {

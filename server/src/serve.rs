@@ -13,10 +13,7 @@ use tonic::transport::{Server as Transport, server::TcpIncoming};
 use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
-    batcher::ModelState,
-    catalog::Catalog,
-    service::{Models, Motion},
-    settings::Settings,
+    batcher::ModelState, catalog::Catalog, models::Models, motion::Motion, settings::Settings,
 };
 
 /// Names of the services in `grpc.health.v1`; the empty one is the whole server.
@@ -160,10 +157,9 @@ async fn report_models(
     reporter: HealthReporter,
     shutdown: CancellationToken,
 ) {
-    let models = catalog
-        .retargeters()
-        .map(|model| (model.card.name.clone(), model.batcher.state()));
-    let mut changes: StreamMap<_, _> = models
+    let mut changes: StreamMap<_, _> = catalog
+        .states()
+        .into_iter()
         .map(|(name, state)| (name, WatchStream::new(state)))
         .collect();
     let mut failed = BTreeSet::new();

@@ -2,16 +2,13 @@
 
 use std::time::Duration;
 
-use emp_models::{
-    CheckpointMetadata,
-    retarget::{AT_LIMIT, RetargetOutput},
-};
+use emp_models::{CheckpointMetadata, controller::ControllerOutput, retarget::AT_LIMIT};
 use emp_proto::v1;
 use emp_robot::{Joint, Robot};
 
 use crate::queue::Answer;
 
-pub(crate) fn timing(answer: &Answer<RetargetOutput>) -> v1::Timing {
+pub(crate) fn timing<O>(answer: &Answer<O>) -> v1::Timing {
     v1::Timing {
         queue_time: Some(duration(answer.queue_time)),
         inference_time: Some(duration(answer.inference_time)),
@@ -44,17 +41,39 @@ fn stands_at_limit(joint: &Joint, angle: f64) -> bool {
     angle <= lower + AT_LIMIT || angle >= upper - AT_LIMIT
 }
 
-pub(crate) fn model_card(name: String, metadata: &CheckpointMetadata) -> v1::Model {
+pub(crate) fn policy_result(output: ControllerOutput) -> v1::PolicyResult {
+    let ControllerOutput {
+        goal,
+        action,
+        leg_targets,
+    } = output;
+    v1::PolicyResult {
+        executable_goal: goal,
+        action,
+        leg_targets,
+    }
+}
+
+pub(crate) fn model_card(
+    name: String,
+    kind: v1::ModelKind,
+    joints: &[Joint],
+    metadata: &CheckpointMetadata,
+) -> v1::Model {
     v1::Model {
         name,
         version: metadata.version().to_owned(),
-        kind: v1::ModelKind::Retargeter.into(),
+        kind: kind.into(),
         robot: metadata.robot.clone(),
-        joint_names: metadata.joints.clone(),
+        joint_names: joint_names(joints),
         weights_sha256: metadata.sha256.clone(),
         git_revision: metadata.git_revision.clone(),
         training: metadata.training.to_string(),
     }
+}
+
+pub(crate) fn joint_names(joints: &[Joint]) -> Vec<String> {
+    joints.iter().map(|joint| joint.name.clone()).collect()
 }
 
 pub(crate) fn robot(robot: &Robot) -> v1::Robot {

@@ -198,6 +198,6 @@ pub fn catalog(settings: &Settings, robot: &Arc<Robot>, gate: &Gate) -> anyhow::
         }) as RetargetBackend)
     };
     let mut catalog = Catalog::default();
-    catalog.add_retargeter(card, Arc::clone(robot), &settings.batching, Box::new(build))?;
+    catalog.add_retargeter(card, robot, &settings.batching, Box::new(build))?;
     Ok(catalog)
 }

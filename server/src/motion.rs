@@ -1,0 +1,243 @@
+//! `MotionService`: what each call does, on top of the catalog and the sessions.
+
+use std::{
+    pin::Pin,
+    sync::Arc,
+    task::{Context, Poll},
+    time::{Duration, Instant},
+};
+
+use emp_models::retarget::RetargetInput;
+use emp_proto::v1::{
+    FrameHeader, RetargetRequest, RetargetResponse, StepPolicyRequest, StepPolicyResponse,
+    StreamPolicyRequest, StreamRetargetRequest, motion_service_server::MotionService,
+};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::Stream;
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status, Streaming, metadata::MetadataMap};
+use tracing::Instrument as _;
+
+use crate::{
+    batcher::Batcher,
+    catalog::Catalog,
+    deadline,
+    error::{FieldError, ServiceError},
+    pose,
+    queue::{Answer, Priority},
+    robot_state,
+    session::{self, Kind, PolicyStream, RetargetStream, SessionContext},
+    settings::StreamSettings,
+    wire,
+};
+
+/// Answers that wait for a slow reader before its session stops.
+const OUTBOUND: usize = 16;
+/// When to ask again for a stream; streams are long.
+const STREAM_RETRY: Duration = Duration::from_secs(1);
+
+/// Retargeting and leg targets, one frame or a stream of them.
+pub(crate) struct Motion {
+    catalog: Arc<Catalog>,
+    drain: CancellationToken,
+    places: Arc<Semaphore>,
+    buffer: usize,
+}
+
+impl Motion {
+    pub(crate) fn new(
+        catalog: Arc<Catalog>,
+        streams: &StreamSettings,
+        drain: CancellationToken,
+    ) -> Self {
+        let places = streams.max_open.get().min(Semaphore::MAX_PERMITS);
+        Self {
+            catalog,
+            drain,
+            places: Arc::new(Semaphore::new(places)),
+            buffer: streams.buffer.get(),
+        }
+    }
+
+    async fn retarget_one(
+        &self,
+        request: Request<RetargetRequest>,
+    ) -> Result<RetargetResponse, ServiceError> {
+        let due = Due::of_call(request.metadata())?;
+        let RetargetRequest {
+            header,
+            robot,
+            model,
+            model_version,
+            refine,
+            pose,
+        } = request.into_inner();
+        let model = self
+            .catalog
+            .retargeter_for(&robot, &model, &model_version)?;
+        let frame = pose::read(pose.as_ref())?;
+        let input = RetargetInput {
+            frame,
+            refine,
+            previous: None,
+        };
+        let deadline = due.with_frame(header.as_ref())?;
+        let answer = compute(&model.batcher, input, deadline).await?;
+        let timing = wire::timing(&answer);
+        let result = wire::retarget_result(
+            &model.robot,
+            answer.output.angles,
+            answer.output.direction_error,
+        );
+        Ok(RetargetResponse {
+            header,
+            result: Some(result),
+            timing: Some(timing),
+        })
+    }
+
+    async fn step_one(
+        &self,
+        request: Request<StepPolicyRequest>,
+    ) -> Result<StepPolicyResponse, ServiceError> {
+        let due = Due::of_call(request.metadata())?;
+        let StepPolicyRequest {
+            header,
+            robot,
+            model,
+            model_version,
+            history,
+            start_heading,
+        } = request.into_inner();
+        let model = self.catalog.policy_for(&robot, &model, &model_version)?;
+        let input = robot_state::read_history(&history, start_heading, &model.model)?;
+        let deadline = due.with_frame(header.as_ref())?;
+        let answer = compute(&model.batcher, input, deadline).await?;
+        let timing = wire::timing(&answer);
+        Ok(StepPolicyResponse {
+            header,
+            result: Some(wire::policy_result(answer.output.output)),
+            timing: Some(timing),
+        })
+    }
+
+    fn open_session<K: Kind>(
+        &self,
+        request: Request<Streaming<K::Request>>,
+    ) -> Result<SessionStream<K>, ServiceError> {
+        if self.drain.is_cancelled() {
+            return Err(ServiceError::ShuttingDown);
+        }
+        let deadline = deadline::of_call(request.metadata(), Instant::now())?;
+        let permit =
+            Arc::clone(&self.places)
+                .try_acquire_owned()
+                .map_err(|_| ServiceError::Overloaded {
+                    what: "there is no room for another stream",
+                    retry: STREAM_RETRY,
+                })?;
+        let (sender, responses) = mpsc::channel(OUTBOUND);
+        let context = SessionContext {
+            catalog: Arc::clone(&self.catalog),
+            buffer: self.buffer,
+            drain: self.drain.clone(),
+            deadline,
+        };
+        // The session has a task of its own: the response's headers go out at once, whatever the client sends first.
+        let session = session::run::<K>(context, request.into_inner(), sender);
+        tokio::spawn(session.in_current_span());
+        Ok(SessionStream {
+            responses,
+            _permit: permit,
+        })
+    }
+}
+
+/// When a unary call's answer is due.
+struct Due {
+    received: Instant,
+    call: Option<Instant>,
+}
+
+impl Due {
+    fn of_call(metadata: &MetadataMap) -> Result<Self, FieldError> {
+        let received = Instant::now();
+        let call = deadline::of_call(metadata, received)?;
+        Ok(Self { received, call })
+    }
+
+    /// The call's deadline or the end of the frame's time budget, whichever is sooner.
+    fn with_frame(&self, header: Option<&FrameHeader>) -> Result<Option<Instant>, FieldError> {
+        let frame = deadline::of_frame(header, self.received)?;
+        Ok(deadline::sooner(self.call, frame))
+    }
+}
+
+/// Brings the input of a unary call to its model.
+async fn compute<I: Send + 'static, O: Send + 'static>(
+    batcher: &Batcher<I, O>,
+    input: I,
+    deadline: Option<Instant>,
+) -> Result<Answer<O>, ServiceError> {
+    if deadline::has_passed(deadline) {
+        return Err(ServiceError::DeadlineExceeded);
+    }
+    let ticket = batcher.submit(Priority::Unary, input, deadline)?;
+    let answer = tokio::select! {
+        outcome = ticket => outcome?,
+        () = deadline::passed(deadline) => return Err(ServiceError::DeadlineExceeded),
+    };
+    if deadline::has_passed(deadline) {
+        return Err(ServiceError::DeadlineExceeded);
+    }
+    Ok(answer)
+}
+
+/// A session's answers. It holds the stream's place until the transport has let go of it.
+pub(crate) struct SessionStream<K: Kind> {
+    responses: mpsc::Receiver<session::Response<K>>,
+    _permit: OwnedSemaphorePermit,
+}
+
+impl<K: Kind> Stream for SessionStream<K> {
+    type Item = session::Response<K>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.responses.poll_recv(context)
+    }
+}
+
+#[tonic::async_trait]
+impl MotionService for Motion {
+    async fn retarget(
+        &self,
+        request: Request<RetargetRequest>,
+    ) -> Result<Response<RetargetResponse>, Status> {
+        Ok(Response::new(self.retarget_one(request).await?))
+    }
+
+    type StreamRetargetStream = SessionStream<RetargetStream>;
+
+    async fn stream_retarget(
+        &self,
+        request: Request<Streaming<StreamRetargetRequest>>,
+    ) -> Result<Response<SessionStream<RetargetStream>>, Status> {
+        Ok(Response::new(self.open_session(request)?))
+    }
+
+    async fn step_policy(
+        &self,
+        request: Request<StepPolicyRequest>,
+    ) -> Result<Response<StepPolicyResponse>, Status> {
+        Ok(Response::new(self.step_one(request).await?))
+    }
+
+    type StreamPolicyStream = SessionStream<PolicyStream>;
+
+    async fn stream_policy(
+        &self,
+        request: Request<Streaming<StreamPolicyRequest>>,
+    ) -> Result<Response<SessionStream<PolicyStream>>, Status> {
+        Ok(Response::new(self.open_session(request)?))
+    }
+}

@@ -1,0 +1,125 @@
+//! `StreamRetarget`: poses in, goal joint angles out.
+
+use std::sync::Arc;
+
+use emp_models::retarget::{RetargetInput, RetargetOutput, Retargeter, Smoother};
+use emp_motion::KeyNodeFrame;
+use emp_proto::v1::{
+    DroppedFrame, FrameHeader, RetargetFrame, RetargetedFrame, StreamRetargetConfig,
+    StreamRetargetRequest, StreamRetargetResponse, StreamStarted,
+    stream_retarget_request::Message as Request, stream_retarget_response::Message as Response,
+};
+
+use super::{Incoming, Kind};
+use crate::{
+    catalog::{Catalog, RetargetModel},
+    error::{FieldError, ServiceError},
+    pose,
+    queue::Answer,
+    wire,
+};
+
+/// What a stream of poses remembers.
+pub(crate) struct RetargetStream {
+    model: Arc<RetargetModel>,
+    refine: bool,
+    smoother: Option<Smoother>,
+    /// The last refined answer, before smoothing.
+    previous: Option<Vec<f32>>,
+}
+
+fn response(message: Response) -> StreamRetargetResponse {
+    StreamRetargetResponse {
+        message: Some(message),
+    }
+}
+
+impl Kind for RetargetStream {
+    type Request = StreamRetargetRequest;
+    type Response = StreamRetargetResponse;
+    type Config = StreamRetargetConfig;
+    type WireFrame = RetargetFrame;
+    type Frame = KeyNodeFrame;
+    type Input = RetargetInput;
+    type Output = RetargetOutput;
+    type Model = Option<Arc<Retargeter>>;
+
+    fn sort(request: StreamRetargetRequest) -> Option<Incoming<Self>> {
+        Some(match request.message? {
+            Request::Config(config) => Incoming::Config(config),
+            Request::Frame(frame) => Incoming::Frame(frame),
+        })
+    }
+
+    fn dropped(notice: DroppedFrame) -> StreamRetargetResponse {
+        response(Response::Dropped(notice))
+    }
+
+    fn delivery(config: &StreamRetargetConfig) -> i32 {
+        config.delivery
+    }
+
+    fn model<'a>(
+        catalog: &'a Catalog,
+        config: &StreamRetargetConfig,
+    ) -> Result<&'a Arc<RetargetModel>, ServiceError> {
+        catalog.retargeter_for(&config.robot, &config.model, &config.model_version)
+    }
+
+    fn open(config: &StreamRetargetConfig, model: &Arc<RetargetModel>) -> Self {
+        Self {
+            model: Arc::clone(model),
+            refine: config.refine,
+            smoother: config.smoothing.then(Smoother::new),
+            previous: None,
+        }
+    }
+
+    fn started(&self) -> StreamRetargetResponse {
+        let card = &self.model.card;
+        response(Response::Started(StreamStarted {
+            robot: card.robot.clone(),
+            model: card.name.clone(),
+            model_version: card.version.clone(),
+            joint_names: card.joint_names.clone(),
+        }))
+    }
+
+    fn header(frame: &RetargetFrame) -> Option<FrameHeader> {
+        frame.header
+    }
+
+    fn read(&mut self, frame: RetargetFrame) -> Result<KeyNodeFrame, FieldError> {
+        pose::read(frame.pose.as_ref())
+    }
+
+    fn input(&mut self, frame: &KeyNodeFrame) -> RetargetInput {
+        RetargetInput {
+            frame: frame.clone(),
+            refine: self.refine,
+            previous: self.previous.clone(),
+        }
+    }
+
+    fn answer(
+        &mut self,
+        header: Option<FrameHeader>,
+        answer: Answer<RetargetOutput>,
+    ) -> StreamRetargetResponse {
+        let timing = wire::timing(&answer);
+        let mut angles = answer.output.angles;
+        if self.refine {
+            self.previous = Some(angles.clone());
+        }
+        if let Some(smoother) = &mut self.smoother {
+            smoother.step(&mut angles);
+        }
+        let result =
+            wire::retarget_result(&self.model.robot, angles, answer.output.direction_error);
+        response(Response::Result(RetargetedFrame {
+            header,
+            result: Some(result),
+            timing: Some(timing),
+        }))
+    }
+}

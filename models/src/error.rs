@@ -43,6 +43,16 @@ pub enum ModelError {
         /// What is wrong and what was expected.
         reason: String,
     },
+    /// A clip cannot be retargeted.
+    #[error("clip {clip:?}, frame {frame}: {reason}")]
+    Clip {
+        /// Name of the clip.
+        clip: String,
+        /// Index of the frame.
+        frame: usize,
+        /// What is wrong and what was expected.
+        reason: String,
+    },
     /// The tensor library refused an operation.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),

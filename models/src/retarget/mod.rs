@@ -1,5 +1,6 @@
 //! Human key nodes to joint angles: the network, the refinement of its answer, temporal smoothing.
 
+mod clips;
 pub mod features;
 pub mod network;
 pub mod objective;
@@ -14,6 +15,7 @@ use emp_robot::Robot;
 use nalgebra::Vector3;
 
 pub use self::{
+    clips::{GoalRows, retarget_clips},
     features::{BONES, Target, features},
     network::{NetworkConfig, RetargetNetwork},
     objective::{Effort, Solver},

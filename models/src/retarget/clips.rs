@@ -1,0 +1,83 @@
+//! Whole clips at once, for training and evaluation: the answers of a stream, faster.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use emp_motion::Clip;
+
+use super::{Retargeter, Smoother, Solver, Target, refine};
+use crate::ModelError;
+
+/// Frames that the network answers at once.
+const BATCH: usize = 256;
+
+/// Goal angles frame by frame: rows of one angle for each goal joint, rad, inside the joints' limits.
+pub type GoalRows = Vec<Vec<f32>>;
+
+/// Retargets clips of any frame rate to goal angles at the robot's control rate, clip by clip in order.
+///
+/// Each clip is answered as a stream of its own: the network, refinement from the previous answer where that is nearer,
+/// and [`Smoother`]. Clips are dealt to `threads` threads (at least one); a clip's answer depends on that clip alone.
+///
+/// # Errors
+/// [`ModelError::Clip`] for the first clip that has a frame which is no pose; when the tensor library fails.
+pub fn retarget_clips(
+    retargeter: &Retargeter,
+    clips: &[Clip],
+    threads: usize,
+) -> Result<Vec<GoalRows>, ModelError> {
+    for clip in clips {
+        clip.validate()
+            .map_err(|(frame, reason)| ModelError::Clip {
+                clip: clip.name.clone(),
+                frame,
+                reason: reason.to_string(),
+            })?;
+    }
+    let next = AtomicUsize::new(0);
+    let work = || -> Vec<(usize, Result<GoalRows, ModelError>)> {
+        let mut answers = Vec::new();
+        while let Some((index, clip)) = {
+            let index = next.fetch_add(1, Ordering::Relaxed);
+            clips.get(index).map(|clip| (index, clip))
+        } {
+            answers.push((index, retarget_clip(retargeter, clip)));
+        }
+        answers
+    };
+    let mut answers: Vec<_> = std::thread::scope(|scope| {
+        let others: Vec<_> = (1..threads).map(|_| scope.spawn(work)).collect();
+        let mut answers = work();
+        for other in others {
+            match other.join() {
+                Ok(more) => answers.extend(more),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        answers
+    });
+    answers.sort_unstable_by_key(|(index, _)| *index);
+    answers.into_iter().map(|(_, answer)| answer).collect()
+}
+
+fn retarget_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {
+    let robot = retargeter.robot();
+    let clip = clip.resampled(robot.control_rate_hz());
+    let joints = robot.goal_joints().len();
+    let mut solver = Solver::new(robot);
+    let mut smoother = Smoother::new();
+    let mut previous: Option<Vec<f32>> = None;
+    let mut rows = GoalRows::with_capacity(clip.frames.len());
+    for frames in clip.frames.chunks(BATCH) {
+        let targets: Vec<Target> = frames.iter().map(Target::new).collect();
+        let (answers, _) = retargeter.predict(&targets)?;
+        for (target, answer) in targets.iter().zip(answers.chunks(joints)) {
+            let mut angles: Vec<f64> = answer.iter().map(|&angle| f64::from(angle)).collect();
+            refine(&mut solver, target, &mut angles, previous.as_deref());
+            let mut row: Vec<f32> = angles.iter().map(|&angle| angle as f32).collect();
+            previous = Some(row.clone());
+            smoother.step(&mut row);
+            rows.push(row);
+        }
+    }
+    Ok(rows)
+}

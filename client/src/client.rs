@@ -9,7 +9,10 @@ use emp_proto::v1::{
 };
 use tonic::transport::{Channel, Endpoint};
 
-use crate::{Answer, Backoff, ClientError, FrameSender, StreamConfig, StreamEvents, driver, wire};
+use crate::{
+    Answer, Backoff, ClientError, FrameSender, PolicyAnswer, PolicyConfig, RobotFrame,
+    StreamConfig, StreamEvents, driver, wire,
+};
 
 /// How long a connection may take to stand.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
@@ -127,6 +130,21 @@ impl Client {
         &self,
         config: StreamConfig,
     ) -> Result<(FrameSender, StreamEvents), ClientError> {
+        driver::start(self.motion_service(), config, self.backoff).await
+    }
+
+    /// Opens a stream of robot states, one a control period; its answers are leg targets. The first frame starts an
+    /// episode, and so does one with `reset`.
+    ///
+    /// A lost connection is restored as that of [`Self::stream`], but the server's history of the robot is lost with it:
+    /// after [`Event::Reconnected`](crate::Event::Reconnected) the next frame starts a new episode.
+    ///
+    /// # Errors
+    /// When the server refuses the stream.
+    pub async fn policy_stream(
+        &self,
+        config: PolicyConfig,
+    ) -> Result<(FrameSender<RobotFrame>, StreamEvents<PolicyAnswer>), ClientError> {
         driver::start(self.motion_service(), config, self.backoff).await
     }
 

@@ -2,11 +2,7 @@
 
 use std::{collections::VecDeque, time::Instant};
 
-use emp_proto::v1::{
-    Delivery, RetargetFrame, RetargetedFrame, StreamRetargetRequest, StreamRetargetResponse,
-    StreamStarted, motion_service_client::MotionServiceClient,
-    stream_retarget_request::Message as Outgoing, stream_retarget_response::Message as Incoming,
-};
+use emp_proto::v1::{Delivery, motion_service_client::MotionServiceClient};
 use tokio::{
     sync::mpsc,
     time::{sleep_until, timeout},
@@ -15,8 +11,11 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming, transport::Channel};
 
 use crate::{
-    Backoff, ClientError, DropCause, Dropped, Event, FrameSender, StreamConfig, StreamEvents,
-    backoff::Break, stream::Outbound, wire,
+    Backoff, ClientError, DropCause, Dropped, Event, FrameSender, StreamEvents,
+    backoff::Break,
+    kind::{Incoming, Kind, Started},
+    stream::Outbound,
+    wire,
 };
 
 /// Most frames without an answer.
@@ -29,19 +28,18 @@ const EVENTS: usize = 256;
 const OPEN_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(10);
 
 /// Opens a stream and starts its driver.
-pub(crate) async fn start(
+pub(crate) async fn start<K: Kind>(
     service: MotionServiceClient<Channel>,
-    config: StreamConfig,
+    config: K,
     backoff: Backoff,
-) -> Result<(FrameSender, StreamEvents), ClientError> {
+) -> Result<(FrameSender<K::Frame>, StreamEvents<K::Answer>), ClientError> {
     let (connection, started) = open(&service, &config).await?;
     let (frames, from_program) = mpsc::channel(HAND_OVER);
     let (to_program, events) = mpsc::channel(EVENTS);
-    let StreamStarted {
+    let Started {
         model,
         model_version,
         joint_names,
-        ..
     } = started;
     let driver = Driver {
         service,
@@ -70,34 +68,24 @@ pub(crate) async fn start(
     ))
 }
 
-/// One call of `StreamRetarget`.
-struct Connection {
+/// One call.
+struct Connection<K: Kind> {
     /// None once half-closed.
-    requests: Option<mpsc::Sender<StreamRetargetRequest>>,
-    responses: Streaming<StreamRetargetResponse>,
+    requests: Option<mpsc::Sender<K::Request>>,
+    responses: Streaming<K::Response>,
 }
 
-async fn open(
+async fn open<K: Kind>(
     service: &MotionServiceClient<Channel>,
-    config: &StreamConfig,
-) -> Result<(Connection, StreamStarted), Break> {
+    config: &K,
+) -> Result<(Connection<K>, Started), Break> {
     let (requests, outbound) = mpsc::channel(HAND_OVER);
-    let first = StreamRetargetRequest {
-        message: Some(Outgoing::Config(config.message())),
-    };
     let opening = async {
         // The channel is new and has room.
-        let _ = requests.send(first).await;
-        let response = service
-            .clone()
-            .stream_retarget(ReceiverStream::new(outbound))
-            .await?;
-        let mut responses = response.into_inner();
-        match responses
-            .message()
-            .await?
-            .and_then(|response| response.message)
-        {
+        let _ = requests.send(config.first()).await;
+        let call = K::call(service.clone(), ReceiverStream::new(outbound));
+        let mut responses = call.await?;
+        match responses.message().await?.and_then(K::sort) {
             Some(Incoming::Started(started)) => Ok((
                 Connection {
                     requests: Some(requests),
@@ -116,23 +104,23 @@ async fn open(
 }
 
 /// A frame without an answer.
-struct Unanswered {
+struct Unanswered<K: Kind> {
     number: u64,
-    message: StreamRetargetRequest,
+    message: K::Request,
     first_sent: Instant,
 }
 
-struct Driver {
+struct Driver<K: Kind> {
     service: MotionServiceClient<Channel>,
-    config: StreamConfig,
+    config: K,
     backoff: Backoff,
-    frames: mpsc::Receiver<Outbound>,
+    frames: mpsc::Receiver<Outbound<K::Frame>>,
     /// Whether the program may still send.
     sending: bool,
-    events: mpsc::Sender<Result<Event, ClientError>>,
-    /// Names and order of the joints of every answer.
+    events: mpsc::Sender<Result<Event<K::Answer>, ClientError>>,
+    /// Names and order of the joints.
     joint_names: Vec<String>,
-    window: VecDeque<Unanswered>,
+    window: VecDeque<Unanswered<K>>,
     /// Index in the window of the first frame that this connection has not seen.
     unsent: usize,
 }
@@ -150,16 +138,16 @@ enum End {
 }
 
 /// What happens next on a connection.
-enum Step {
+enum Step<K: Kind> {
     /// The next frame went out, or found the transport gone.
     Sent(bool),
     /// The program has another frame, or sends no more.
-    Frame(Option<Outbound>),
-    Response(Result<Option<StreamRetargetResponse>, Status>),
+    Frame(Option<Outbound<K::Frame>>),
+    Response(Result<Option<K::Response>, Status>),
 }
 
-impl Driver {
-    async fn run(mut self, mut connection: Connection) {
+impl<K: Kind> Driver<K> {
+    async fn run(mut self, mut connection: Connection<K>) {
         loop {
             let end = self.converse(connection).await;
             let end = match end {
@@ -183,16 +171,16 @@ impl Driver {
         }
     }
 
-    async fn converse(&mut self, mut connection: Connection) -> End {
+    async fn converse(&mut self, mut connection: Connection<K>) -> End {
         loop {
             if !self.sending && self.unsent == self.window.len() {
                 connection.requests = None;
             }
             let has_unsent = self.unsent < self.window.len();
             let has_room = self.window.len() < WINDOW;
-            let step = tokio::select! {
+            let step: Step<K> = tokio::select! {
                 () = self.events.closed() => return End::Abandoned,
-                sent = send(connection.requests.as_ref(), self.window.get(self.unsent)), if has_unsent => Step::Sent(sent),
+                sent = send::<K>(connection.requests.as_ref(), self.window.get(self.unsent)), if has_unsent => Step::Sent(sent),
                 frame = self.frames.recv(), if self.sending && has_room => Step::Frame(frame),
                 response = connection.responses.message() => Step::Response(response),
             };
@@ -222,22 +210,12 @@ impl Driver {
     }
 
     /// Takes an answered or dropped frame out of the window.
-    fn event(&mut self, response: StreamRetargetResponse) -> Result<Event, ClientError> {
-        match response.message {
-            Some(Incoming::Result(RetargetedFrame {
-                header,
-                result,
-                timing,
-            })) => {
-                let number = header.unwrap_or_default().sequence_number;
+    fn event(&mut self, response: K::Response) -> Result<Event<K::Answer>, ClientError> {
+        match K::sort(response) {
+            Some(Incoming::Result { number, message }) => {
                 let first_sent = self.settle(number)?;
-                let result = result.ok_or(ClientError::Contract("an answer without a result"))?;
-                Ok(Event::Answer(wire::answer(
-                    number,
-                    result,
-                    timing,
-                    first_sent.elapsed(),
-                )))
+                let answer = K::answer(number, message, first_sent.elapsed())?;
+                Ok(Event::Answer(answer))
             }
             Some(Incoming::Dropped(message)) => {
                 let dropped = wire::dropped(message);
@@ -266,7 +244,7 @@ impl Driver {
     }
 
     /// Restores the connection, or says why it cannot be.
-    async fn reconnect(&mut self, mut last: Break) -> Result<Connection, End> {
+    async fn reconnect(&mut self, mut last: Break) -> Result<Connection<K>, End> {
         let start = Instant::now();
         self.unsent = 0;
         for attempt in 1.. {
@@ -312,7 +290,7 @@ impl Driver {
 
     /// Waits for the next attempt. With `LATEST` whatever is unanswered or sent meanwhile is dropped: it would be stale.
     async fn wait(&mut self, until: Instant) -> bool {
-        let latest = self.config.delivery == Delivery::Latest;
+        let latest = self.config.delivery() == Delivery::Latest;
         loop {
             while latest && let Some(frame) = self.window.pop_front() {
                 if !self.tell(lost(frame.number)).await {
@@ -331,15 +309,15 @@ impl Driver {
     }
 
     /// Hands an event to the program; false when it let go.
-    async fn tell(&self, event: Event) -> bool {
+    async fn tell(&self, event: Event<K::Answer>) -> bool {
         self.events.send(Ok(event)).await.is_ok()
     }
 }
 
 /// Hands a frame to the transport; false when that is gone.
-async fn send(
-    requests: Option<&mpsc::Sender<StreamRetargetRequest>>,
-    frame: Option<&Unanswered>,
+async fn send<K: Kind>(
+    requests: Option<&mpsc::Sender<K::Request>>,
+    frame: Option<&Unanswered<K>>,
 ) -> bool {
     match (requests, frame) {
         (Some(requests), Some(frame)) => match requests.reserve().await {
@@ -353,28 +331,20 @@ async fn send(
     }
 }
 
-fn unanswered(frame: Outbound) -> Unanswered {
+fn unanswered<K: Kind>(outbound: Outbound<K::Frame>) -> Unanswered<K> {
     let Outbound {
         number,
-        pose,
+        frame,
         time_budget,
-    } = frame;
-    let header = Some(wire::header(number, time_budget));
-    let frame = RetargetFrame {
-        header,
-        pose: Some(wire::pose(&pose)),
-    };
-    let message = StreamRetargetRequest {
-        message: Some(Outgoing::Frame(frame)),
-    };
+    } = outbound;
     Unanswered {
         number,
-        message,
+        message: K::frame(wire::header(number, time_budget), &frame),
         first_sent: Instant::now(),
     }
 }
 
-fn lost(number: u64) -> Event {
+fn lost<A>(number: u64) -> Event<A> {
     Event::Dropped(Dropped {
         sequence_number: number,
         cause: DropCause::ConnectionLost,

@@ -1,5 +1,5 @@
-//! The client library: human poses go to a server of `emp.v1`, joint targets come back, by single calls or as a stream
-//! that survives a lost connection.
+//! The client library: human poses and robot states go to a server of `emp.v1`, joint targets come back, by single calls
+//! or as a stream that survives a lost connection; controllers are evaluated there on a set of motions.
 //!
 //! It links neither MuJoCo nor candle and computes no joint angle: it installs in a minute on an operator's laptop.
 //!
@@ -33,6 +33,7 @@ mod backoff;
 mod client;
 mod driver;
 mod error;
+mod kind;
 mod statistics;
 mod stream;
 mod wire;
@@ -41,7 +42,10 @@ pub use backoff::Backoff;
 pub use client::Client;
 pub use emp_proto::v1::{Delivery, DropReason, Joint, KeyNode, Model, Robot};
 pub use error::ClientError;
-pub use statistics::{BatchStatistics, DirectionError, Percentiles, Statistics, Summary};
+pub use statistics::{
+    BatchStatistics, Counted, DirectionError, Percentiles, RetargetingSummary, Statistics, Summary,
+};
 pub use stream::{
-    Answer, DropCause, Dropped, Event, FrameSender, StreamClosed, StreamConfig, StreamEvents,
+    Answer, AnswerTimes, DropCause, Dropped, Event, FrameSender, PolicyAnswer, PolicyConfig,
+    RobotFrame, StreamClosed, StreamConfig, StreamEvents,
 };

@@ -158,15 +158,17 @@ fn print_summary(summary: &Summary, command: &Retarget) {
         "  batch      mean {:.2}, largest {}",
         summary.batch.mean, summary.batch.max
     );
-    let error = &summary.direction_error_deg;
-    println!(
-        "  direction  mean {:.2}°, p95 {:.2}° off the person's arms",
-        error.mean, error.p95
-    );
-    println!(
-        "  limits     {:.1} % of frames with a joint at a limit",
-        100.0 * summary.limit_share
-    );
+    if let Some(retargeting) = &summary.retargeting {
+        let error = &retargeting.direction_error_deg;
+        println!(
+            "  direction  mean {:.2}°, p95 {:.2}° off the person's arms",
+            error.mean, error.p95
+        );
+        println!(
+            "  limits     {:.1} % of frames with a joint at a limit",
+            100.0 * retargeting.limit_share
+        );
+    }
     let dropped: Vec<_> = summary
         .dropped
         .iter()

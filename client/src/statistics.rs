@@ -8,7 +8,7 @@ use std::{
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-use crate::{Answer, Event};
+use crate::{Answer, AnswerTimes, Event, PolicyAnswer};
 
 /// Three significant digits, values clamped to a minute, in microseconds.
 const DIGITS: u8 = 3;
@@ -54,6 +54,14 @@ pub struct Summary {
     pub inference_ms: Percentiles,
     /// Frames a batch.
     pub batch: BatchStatistics,
+    /// How well poses were met; none where the stream answered no pose.
+    #[serde(flatten)]
+    pub retargeting: Option<RetargetingSummary>,
+}
+
+/// How well the answers of a stream met its poses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct RetargetingSummary {
     /// Between the person's and the robot's arm bones, degrees.
     pub direction_error_deg: DirectionError,
     /// Share of answers with at least one joint at a limit, 0 to 1.
@@ -91,6 +99,33 @@ pub struct DirectionError {
     pub p95: f64,
 }
 
+/// An answer that [`Statistics`] can count.
+pub trait Counted {
+    /// Where its time went.
+    fn times(&self) -> AnswerTimes;
+
+    /// The pose's answer, if it is one.
+    fn as_retargeted(&self) -> Option<&Answer> {
+        None
+    }
+}
+
+impl Counted for Answer {
+    fn times(&self) -> AnswerTimes {
+        self.times
+    }
+
+    fn as_retargeted(&self) -> Option<&Answer> {
+        Some(self)
+    }
+}
+
+impl Counted for PolicyAnswer {
+    fn times(&self) -> AnswerTimes {
+        self.times
+    }
+}
+
 impl Statistics {
     /// Starts to count, and the clock.
     pub fn new() -> Self {
@@ -109,23 +144,31 @@ impl Statistics {
     }
 
     /// Counts an event.
-    pub fn record(&mut self, event: &Event) {
+    pub fn record<A: Counted>(&mut self, event: &Event<A>) {
         match event {
-            Event::Answer(answer) => self.record_answer(answer),
+            Event::Answer(answer) => {
+                self.record_times(&answer.times());
+                if let Some(answer) = answer.as_retargeted() {
+                    self.record_retargeted(answer);
+                }
+            }
             Event::Dropped(dropped) => *self.dropped.entry(dropped.cause.name()).or_default() += 1,
             Event::Reconnected { .. } => self.reconnects += 1,
             Event::ConnectionLost { .. } => {}
         }
     }
 
-    fn record_answer(&mut self, answer: &Answer) {
+    fn record_times(&mut self, times: &AnswerTimes) {
         self.answered += 1;
-        self.at_limit += u64::from(!answer.joints_at_limit.is_empty());
-        self.latency.saturating_record(micros(answer.latency));
-        self.queue.saturating_record(micros(answer.queue_time));
+        self.latency.saturating_record(micros(times.latency));
+        self.queue.saturating_record(micros(times.queue_time));
         self.inference
-            .saturating_record(micros(answer.inference_time));
-        self.batch.saturating_record(u64::from(answer.batch_size));
+            .saturating_record(micros(times.inference_time));
+        self.batch.saturating_record(u64::from(times.batch_size));
+    }
+
+    fn record_retargeted(&mut self, answer: &Answer) {
+        self.at_limit += u64::from(!answer.joints_at_limit.is_empty());
         let hundredths = (answer.direction_error.to_degrees() * 100.0).round();
         self.direction_error.saturating_record(hundredths as u64);
     }
@@ -133,13 +176,6 @@ impl Statistics {
     /// What was counted so far.
     pub fn summary(&self) -> Summary {
         let seconds = self.start.elapsed().as_secs_f64();
-        let share = |part: u64| {
-            if self.answered == 0 {
-                0.0
-            } else {
-                part as f64 / self.answered as f64
-            }
-        };
         Summary {
             frames: self.answered + self.dropped.values().sum::<u64>(),
             answered: self.answered,
@@ -154,12 +190,19 @@ impl Statistics {
                 mean: self.batch.mean(),
                 max: self.batch.max(),
             },
+            retargeting: self.retargeting(),
+        }
+    }
+
+    fn retargeting(&self) -> Option<RetargetingSummary> {
+        let poses = self.direction_error.len();
+        (poses > 0).then(|| RetargetingSummary {
             direction_error_deg: DirectionError {
                 mean: self.direction_error.mean() / 100.0,
                 p95: self.direction_error.value_at_quantile(0.95) as f64 / 100.0,
             },
-            limit_share: share(self.at_limit),
-        }
+            limit_share: self.at_limit as f64 / poses as f64,
+        })
     }
 }
 
@@ -208,13 +251,15 @@ mod tests {
                 } else {
                     Vec::new()
                 },
-                queue_time: Duration::from_micros(10),
-                inference_time: Duration::from_micros(200),
-                batch_size: 1 + u32::from(number % 2 == 0),
-                latency: Duration::from_millis(1 + number),
+                times: AnswerTimes {
+                    queue_time: Duration::from_micros(10),
+                    inference_time: Duration::from_micros(200),
+                    batch_size: 1 + u32::from(number % 2 == 0),
+                    latency: Duration::from_millis(1 + number),
+                },
             }));
         }
-        statistics.record(&Event::Dropped(Dropped {
+        statistics.record::<Answer>(&Event::Dropped(Dropped {
             sequence_number: 100,
             cause: DropCause::Server(DropReason::Superseded),
             field: String::new(),
@@ -229,7 +274,8 @@ mod tests {
         assert!((summary.latency_ms.p50 - 50.0).abs() < 0.1);
         assert!((summary.latency_ms.max - 100.0).abs() < 0.1);
         assert!((summary.batch.mean - 1.5).abs() < 1e-9 && summary.batch.max == 2);
-        assert!((summary.direction_error_deg.mean - 5.73).abs() < 0.01);
-        assert!((summary.limit_share - 0.25).abs() < 1e-9);
+        let retargeting = summary.retargeting.expect("poses were answered");
+        assert!((retargeting.direction_error_deg.mean - 5.73).abs() < 0.01);
+        assert!((retargeting.limit_share - 0.25).abs() < 1e-9);
     }
 }

@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use emp_motion::KeyNodeFrame;
-use emp_proto::v1::{Delivery, DropReason, StreamRetargetConfig};
+use emp_proto::v1::{Delivery, DropReason, StreamPolicyConfig, StreamRetargetConfig};
+use nalgebra::UnitQuaternion;
 use tokio::sync::mpsc;
 
 use crate::ClientError;
 
-/// What holds for a whole stream.
+/// What holds for a whole stream of poses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreamConfig {
     /// The robot's name.
@@ -50,7 +51,83 @@ impl StreamConfig {
     }
 }
 
-/// The answer to one frame.
+/// What holds for a whole stream of robot states.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PolicyConfig {
+    /// The robot's name.
+    pub robot: String,
+    /// The policy's name; empty for the robot's own.
+    pub model: String,
+    /// The version that the policy must have; empty for any.
+    pub model_version: String,
+    /// Whether every frame is computed, or only the newest.
+    pub delivery: Delivery,
+}
+
+impl PolicyConfig {
+    /// Every frame, with the robot's own policy.
+    pub fn for_robot(robot: impl Into<String>) -> Self {
+        Self {
+            robot: robot.into(),
+            model: String::new(),
+            model_version: String::new(),
+            delivery: Delivery::All,
+        }
+    }
+
+    pub(crate) fn message(&self) -> StreamPolicyConfig {
+        StreamPolicyConfig {
+            robot: self.robot.clone(),
+            model: self.model.clone(),
+            model_version: self.model_version.clone(),
+            delivery: self.delivery.into(),
+        }
+    }
+}
+
+/// One control period of a robot: what it measures, and what its upper body is to do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RobotFrame {
+    /// Angles of all joints, the goal joints before the leg joints, radians.
+    pub joint_positions: Vec<f32>,
+    /// Orientation of the base in a world frame with z up.
+    pub orientation: UnitQuaternion<f64>,
+    /// Angles that the goal joints are to take, radians.
+    pub goal: Vec<f32>,
+    /// Whether this is the first control period of an episode.
+    pub reset: bool,
+}
+
+/// The answer to one control period.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PolicyAnswer {
+    /// The frame's number, as [`FrameSender::send`] gave it.
+    pub sequence_number: u64,
+    /// Angles for the goal joints as they should be executed, radians.
+    pub executable_goal: Vec<f32>,
+    /// The policy's action, one number a leg joint.
+    pub action: Vec<f32>,
+    /// Target angles of the leg joints, radians.
+    pub leg_targets: Vec<f32>,
+    /// Where the time went.
+    pub times: AnswerTimes,
+}
+
+/// Where the time of one answer went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct AnswerTimes {
+    /// How long the frame waited for the model.
+    pub queue_time: Duration,
+    /// How long the model took for the batch.
+    pub inference_time: Duration,
+    /// How many frames the batch had.
+    pub batch_size: u32,
+    /// From sending the frame to receiving the answer, on the client's clock. A frame that was sent again counts from
+    /// its first time.
+    pub latency: Duration,
+}
+
+/// The answer to one pose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
     /// The frame's number, as [`FrameSender::send`] gave it.
@@ -61,15 +138,8 @@ pub struct Answer {
     pub direction_error: f32,
     /// Names of the joints that stand at a limit.
     pub joints_at_limit: Vec<String>,
-    /// How long the frame waited for the model.
-    pub queue_time: Duration,
-    /// How long the model took for the batch.
-    pub inference_time: Duration,
-    /// How many frames the batch had.
-    pub batch_size: u32,
-    /// From sending the frame to receiving this, on the client's clock. A frame that was sent again counts from its
-    /// first time.
-    pub latency: Duration,
+    /// Where the time went.
+    pub times: AnswerTimes,
 }
 
 /// A frame without an answer.
@@ -109,11 +179,11 @@ impl DropCause {
     }
 }
 
-/// What a stream tells.
+/// What a stream tells; `A` is what it answers to a frame.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Event {
+pub enum Event<A = Answer> {
     /// A frame was answered.
-    Answer(Answer),
+    Answer(A),
     /// A frame was dropped.
     Dropped(Dropped),
     /// The connection was lost, or an attempt to restore it failed.
@@ -134,16 +204,16 @@ pub enum Event {
 
 /// The sending end. Dropping it half-closes the stream: what is on its way is still answered.
 #[derive(Debug)]
-pub struct FrameSender {
-    pub(crate) frames: mpsc::Sender<Outbound>,
+pub struct FrameSender<F = KeyNodeFrame> {
+    pub(crate) frames: mpsc::Sender<Outbound<F>>,
     pub(crate) next_number: u64,
 }
 
 /// A frame on its way to the connection.
 #[derive(Debug)]
-pub(crate) struct Outbound {
+pub(crate) struct Outbound<F> {
     pub(crate) number: u64,
-    pub(crate) pose: KeyNodeFrame,
+    pub(crate) frame: F,
     pub(crate) time_budget: Option<Duration>,
 }
 
@@ -152,20 +222,20 @@ pub(crate) struct Outbound {
 #[error("the stream has ended")]
 pub struct StreamClosed;
 
-impl FrameSender {
-    /// Sends a pose and gives its number: 0, 1, 2 … Waits while the server is behind (delivery `ALL`).
+impl<F: Clone> FrameSender<F> {
+    /// Sends a frame and gives its number: 0, 1, 2 … Waits while the server is behind (delivery `ALL`).
     ///
     /// # Errors
     /// When the stream has ended.
     pub async fn send(
         &mut self,
-        pose: &KeyNodeFrame,
+        frame: &F,
         time_budget: Option<Duration>,
     ) -> Result<u64, StreamClosed> {
         let number = self.next_number;
         let outbound = Outbound {
             number,
-            pose: pose.clone(),
+            frame: frame.clone(),
             time_budget,
         };
         self.frames.send(outbound).await.map_err(|_| StreamClosed)?;
@@ -176,15 +246,16 @@ impl FrameSender {
 
 /// The receiving end. Dropping it cancels the stream.
 #[derive(Debug)]
-pub struct StreamEvents {
+pub struct StreamEvents<A = Answer> {
     pub(crate) joint_names: Vec<String>,
     pub(crate) model: String,
     pub(crate) model_version: String,
-    pub(crate) events: mpsc::Receiver<Result<Event, ClientError>>,
+    pub(crate) events: mpsc::Receiver<Result<Event<A>, ClientError>>,
 }
 
-impl StreamEvents {
-    /// Names of the joints, in the order of every answer.
+impl<A> StreamEvents<A> {
+    /// Names of the joints: those of every answer to a pose, or those of a robot's state (the goal joints, then the leg
+    /// joints), in order.
     pub fn joint_names(&self) -> &[String] {
         &self.joint_names
     }
@@ -198,7 +269,7 @@ impl StreamEvents {
     ///
     /// # Errors
     /// When the stream ended before that. It is the last event.
-    pub async fn next(&mut self) -> Result<Option<Event>, ClientError> {
+    pub async fn next(&mut self) -> Result<Option<Event<A>>, ClientError> {
         self.events.recv().await.transpose()
     }
 }

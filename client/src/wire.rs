@@ -6,7 +6,7 @@ use emp_motion::{KeyNode, KeyNodeFrame};
 use emp_proto::v1;
 use nalgebra::{Rotation3, UnitQuaternion};
 
-use crate::stream::{Answer, DropCause, Dropped};
+use crate::stream::{Answer, AnswerTimes, DropCause, Dropped, PolicyAnswer, RobotFrame};
 
 pub(crate) fn pose(frame: &KeyNodeFrame) -> v1::HumanPose {
     let position = |node: KeyNode| {
@@ -27,13 +27,16 @@ pub(crate) fn pose(frame: &KeyNodeFrame) -> v1::HumanPose {
         right_elbow: position(KeyNode::RightElbow),
         left_wrist: position(KeyNode::LeftWrist),
         right_wrist: position(KeyNode::RightWrist),
-        left_wrist_orientation: left.as_ref().map(quaternion),
-        right_wrist_orientation: right.as_ref().map(quaternion),
+        left_wrist_orientation: left.as_ref().map(hand),
+        right_wrist_orientation: right.as_ref().map(hand),
     }
 }
 
-fn quaternion(rotation: &Rotation3<f32>) -> v1::Quaternion {
-    let q = UnitQuaternion::from_rotation_matrix(rotation);
+fn hand(rotation: &Rotation3<f32>) -> v1::Quaternion {
+    quaternion(&UnitQuaternion::from_rotation_matrix(rotation))
+}
+
+fn quaternion(q: &UnitQuaternion<f32>) -> v1::Quaternion {
     v1::Quaternion {
         w: q.w,
         x: q.i,
@@ -51,18 +54,51 @@ pub(crate) fn header(sequence_number: u64, time_budget: Option<Duration>) -> v1:
     }
 }
 
+pub(crate) fn robot_frame(header: v1::FrameHeader, frame: &RobotFrame) -> v1::PolicyFrame {
+    v1::PolicyFrame {
+        header: Some(header),
+        state: Some(v1::RobotState {
+            joint_positions: frame.joint_positions.clone(),
+            base_orientation: Some(quaternion(&frame.orientation.cast())),
+        }),
+        goal: frame.goal.clone(),
+        reset: frame.reset,
+    }
+}
+
 pub(crate) fn answer(
     sequence_number: u64,
     result: v1::RetargetResult,
     timing: Option<v1::Timing>,
     latency: Duration,
 ) -> Answer {
-    let timing = timing.unwrap_or_default();
     Answer {
         sequence_number,
         joint_angles: result.joint_angles,
         direction_error: result.direction_error,
         joints_at_limit: result.joints_at_limit,
+        times: times(timing, latency),
+    }
+}
+
+pub(crate) fn policy_answer(
+    sequence_number: u64,
+    result: v1::PolicyResult,
+    timing: Option<v1::Timing>,
+    latency: Duration,
+) -> PolicyAnswer {
+    PolicyAnswer {
+        sequence_number,
+        executable_goal: result.executable_goal,
+        action: result.action,
+        leg_targets: result.leg_targets,
+        times: times(timing, latency),
+    }
+}
+
+fn times(timing: Option<v1::Timing>, latency: Duration) -> AnswerTimes {
+    let timing = timing.unwrap_or_default();
+    AnswerTimes {
         queue_time: duration(timing.queue_time),
         inference_time: duration(timing.inference_time),
         batch_size: timing.batch_size,

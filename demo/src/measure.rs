@@ -106,7 +106,9 @@ pub(crate) fn summary(
         direction_error_in_physics_deg: Spread::of(reached.as_flattened()),
         jumps: moves.iter().filter(|&&step| step > JUMP).count(),
         largest_jump_rad: moves.iter().copied().fold(0.0, f32::max),
-        limit_share: statistics.limit_share,
+        limit_share: statistics
+                .retargeting
+                .map_or(0.0, |retargeting| retargeting.limit_share),
         self_collision_share: SelfCollision::new(robot)?.share(&answers.targets)?,
         self_collision_in_physics_share: replay.self_collision_share(),
         saturated_share: replay.saturated_share,

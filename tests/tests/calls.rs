@@ -88,7 +88,7 @@ async fn real_weights_answer_as_in_process_and_batches_as_single() -> anyhow::Re
                 .fold(0.0, f32::max);
             differing += usize::from(difference > BATCH_TOLERANCE);
             assert!((answer.direction_error - alone.direction_error).abs() <= DIRECTION_TOLERANCE);
-            largest_batch = largest_batch.max(answer.batch_size);
+            largest_batch = largest_batch.max(answer.times.batch_size);
         }
         let allowed = if refine { 0 } else { CODE_TIES };
         assert!(

@@ -1,5 +1,7 @@
 //! Goal-joint angles over time.
 
+use emp_models::retarget::{Retargeter, retarget_clips};
+use emp_motion::Clip;
 use emp_robot::{JointMirror, Robot};
 use serde::{Deserialize, Serialize};
 
@@ -67,6 +69,23 @@ impl GoalClip {
         };
         clip.clamp(robot);
         Ok(clip)
+    }
+
+    /// What `retargeter` makes of human motion: a clip of goals for each clip, in order, on `threads` threads.
+    ///
+    /// # Errors
+    /// If a frame of `motion` is no pose, or the network fails.
+    pub fn retargeted(
+        retargeter: &Retargeter,
+        motion: &[Clip],
+        source: Source,
+        threads: usize,
+    ) -> Result<Vec<Self>, GoalError> {
+        let rows = retarget_clips(retargeter, motion, threads)?;
+        let clips = motion.iter().zip(rows);
+        clips
+            .map(|(clip, rows)| Self::new(retargeter.robot(), &clip.name, source, &rows))
+            .collect()
     }
 
     /// Number of frames, at least 1.

@@ -5,6 +5,7 @@ mod library;
 mod statistics;
 mod stream;
 
+use emp_models::ModelError;
 use emp_robot::RobotError;
 
 pub use clip::{GoalClip, Source};
@@ -48,6 +49,9 @@ pub enum GoalError {
         /// Joints of the clip.
         found: usize,
     },
+    /// Human motion could not be retargeted.
+    #[error(transparent)]
+    Retarget(#[from] ModelError),
     /// The robot has no mirror image.
     #[error("goals cannot be mirrored: {0}")]
     Mirror(#[from] RobotError),

@@ -1,3 +1,4 @@
+use emp_models::retarget::Retargeter;
 use emp_robot::Robot;
 
 use super::*;
@@ -264,5 +265,30 @@ fn what_is_no_goal_is_refused_by_clip_and_frame() {
         );
         assert!(new(&[good, vec![0.0; 3]]).unwrap_err().contains("frame 1"));
         assert!(GoalLibrary::new(robot, Vec::new()).is_err());
+    });
+}
+
+#[test]
+fn retargeted_motion_is_goals() {
+    for_each_robot(|robot| {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let robot =
+            std::sync::Arc::new(Robot::load(&root.join("robots").join(robot.name())).unwrap());
+        let weights = format!("models/weights/{}-retargeter.safetensors", robot.name());
+        let retargeter = Retargeter::load(&root.join(weights), robot.clone()).unwrap();
+        let motion = emp_motion::skills::library(1, 3);
+        let clips = GoalClip::retargeted(&retargeter, &motion, Source::Procedural, 2).unwrap();
+        for (clip, motion) in clips.iter().zip(&motion) {
+            assert_eq!(
+                (&clip.name, clip.len()),
+                (&motion.name, motion.frames.len())
+            );
+        }
+        let statistics = GoalStatistics::of(&robot, &clips).unwrap();
+        // People at work: hands at 0.1 to 1 m/s on average.
+        assert!(
+            (0.1..1.0).contains(&statistics.hand_speed.mean),
+            "{statistics:?}"
+        );
     });
 }

@@ -25,6 +25,7 @@ pub(crate) struct Config {
     pub(crate) key_nodes: KeyNodes,
     pub(crate) links: Links,
     pub(crate) contacts: Contacts,
+    pub(crate) randomization: RandomizationConfig,
 }
 
 #[derive(Debug, Deserialize)]
@@ -170,6 +171,15 @@ pub(crate) struct FootConfig {
     pub(crate) centers: Vec<[f64; 3]>,
 }
 
+/// Ranges of masses, kg.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct RandomizationConfig {
+    pub(crate) base_mass: [f64; 2],
+    pub(crate) hand_mass: [f64; 2],
+    pub(crate) test_hand_load: [f64; 2],
+}
+
 impl Config {
     /// Reads `file` and checks every value that can be judged without the model.
     pub(crate) fn load(file: &Path) -> Result<Self, RobotError> {
@@ -209,7 +219,8 @@ impl Checks<'_> {
         self.joints(&config.joints)?;
         self.key_nodes(&config.key_nodes)?;
         self.links(&config.links)?;
-        self.contacts(&config.contacts)
+        self.contacts(&config.contacts)?;
+        self.randomization(&config.randomization)
     }
 
     fn fail(
@@ -271,6 +282,22 @@ impl Checks<'_> {
                 expected,
                 format!("{} ({steps} steps)", control.timestep),
             );
+        }
+        Ok(())
+    }
+
+    fn randomization(&self, ranges: &RandomizationConfig) -> Result<(), RobotError> {
+        let rows = [
+            ("randomization.base_mass", ranges.base_mass, f64::MIN),
+            ("randomization.hand_mass", ranges.hand_mass, 0.0),
+            ("randomization.test_hand_load", ranges.test_hand_load, 0.0),
+        ];
+        for (key, [low, high], least) in rows {
+            // Comparisons with NaN are false.
+            if !(least <= low && low <= high && high <= f64::MAX) {
+                let expected = "a range of masses from low to high, those of hands 0 or above";
+                return self.fail(key, expected, format!("[{low}, {high}]"));
+            }
         }
         Ok(())
     }

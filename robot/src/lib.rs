@@ -21,5 +21,6 @@ pub use error::RobotError;
 pub use kinematics::{FrameKinematics, Kinematics, OutputLayout, Real};
 pub use mirror::JointMirror;
 pub use robot::{
-    Foot, GoalNode, Joint, KEY_NODE_NAMES, KEY_NODES, KeyNodeSite, LinkSphere, Robot, robot_folders,
+    AddedMasses, Foot, GoalNode, Joint, KEY_NODE_NAMES, KEY_NODES, KeyNodeSite, LinkSphere, Robot,
+    robot_folders,
 };

@@ -106,6 +106,17 @@ pub struct Foot {
     pub geoms: Vec<String>,
 }
 
+/// Ranges of masses that are added to the robot, kg: the paper's for a robot of 60 kg, scaled to this one's mass.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AddedMasses {
+    /// To the base, in training.
+    pub base: [f64; 2],
+    /// To each hand, in training.
+    pub hand: [f64; 2],
+    /// To each hand, in tests.
+    pub test_hand: [f64; 2],
+}
+
 impl Foot {
     fn new(config: &FootConfig) -> Self {
         Self {
@@ -296,6 +307,16 @@ impl Robot {
     /// Mass of the whole robot, kg.
     pub fn mass(&self) -> f64 {
         self.model.totalmass()
+    }
+
+    /// Ranges of masses that training and tests add.
+    pub fn added_masses(&self) -> AddedMasses {
+        let ranges = &self.config.randomization;
+        AddedMasses {
+            base: ranges.base_mass,
+            hand: ranges.hand_mass,
+            test_hand: ranges.test_hand_load,
+        }
     }
 
     /// Forward kinematics.

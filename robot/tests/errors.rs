@@ -63,6 +63,24 @@ const CASES: &[Case] = &[
     ),
     // Values.
     toml(
+        "hand_mass = [0.0, 2.5]",
+        "hand_mass = [-1.0, 2.5]",
+        &[
+            "robot.toml: randomization.hand_mass: expected a range",
+            "found [-1, 2.5]",
+        ],
+    ),
+    toml(
+        "base_mass = [-5.0, 5.0]",
+        "base_mass = [5.0, -5.0]",
+        &["robot.toml: randomization.base_mass: expected a range"],
+    ),
+    toml(
+        "test_hand_load = [0.8, 1.2]",
+        "test_hand_load = [0.8, inf]",
+        &["robot.toml: randomization.test_hand_load", "inf"],
+    ),
+    toml(
         "name = \"emp27\"",
         "name = \"\"",
         &["robot.toml: name: expected a name"],

@@ -47,6 +47,22 @@ pub enum SimError {
         /// Name of the body.
         body: String,
     },
+    /// A setting of the environment is out of bounds.
+    #[error("{name}: expected {expected}, found {found}")]
+    Setting {
+        /// Name of the setting.
+        name: String,
+        /// What it may be.
+        expected: String,
+        /// What it is.
+        found: String,
+    },
+    /// A snapshot is not one of these environments.
+    #[error("the snapshot does not fit: {0}")]
+    Snapshot(String),
+    /// A policy could not be run.
+    #[error("the policy failed: {0}")]
+    Policy(#[from] emp_models::ModelError),
     /// The system gave no threads for a pool.
     #[error("cannot start threads for simulation: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),

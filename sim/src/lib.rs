@@ -20,6 +20,7 @@
 
 mod collision;
 mod divergence;
+pub mod environment;
 mod error;
 pub mod goals;
 mod physics;

@@ -17,4 +17,5 @@ pub use body::{Body, FootReading, Reading, SelfContact};
 pub use parameters::BodyParameters;
 pub use stage::{Stage, Start, Targets};
 
+pub(crate) use parameters::factor;
 pub(crate) use rig::Rig;

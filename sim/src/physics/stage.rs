@@ -117,6 +117,11 @@ impl Stage {
         body
     }
 
+    /// Mass of the body that stood here last, kg.
+    pub(crate) fn mass(&self) -> f64 {
+        self.data.model().body_subtreemass()[self.rig.base]
+    }
+
     /// Simulates `body` for one control period with the given targets, and measures it.
     ///
     /// The motors follow the new targets after the body's delay, the previous ones until then; in the physics step in which

@@ -1,0 +1,64 @@
+//! Settings of the training environments.
+
+use emp_robot::Robot;
+use serde::{Deserialize, Serialize};
+
+use super::{Randomization, RewardWeights};
+use crate::SimError;
+
+/// Settings of the training environments. The default is the paper's.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EnvironmentConfig {
+    /// What differs between episodes.
+    pub randomization: Randomization,
+    /// Weights of the reward's terms.
+    pub rewards: RewardWeights,
+    /// Control periods after which an episode times out.
+    pub episode_frames: usize,
+    /// An episode ends when the projected gravity is larger than this along the base's x or y axis.
+    pub tilt_limit: f64,
+    /// An episode ends when the base is lower than this share of its standing height.
+    pub height_limit: f64,
+}
+
+impl Default for EnvironmentConfig {
+    fn default() -> Self {
+        Self {
+            randomization: Randomization::default(),
+            rewards: RewardWeights::default(),
+            episode_frames: 500,
+            tilt_limit: 0.7,
+            height_limit: 1.0 / 3.0,
+        }
+    }
+}
+
+impl EnvironmentConfig {
+    /// Refuses settings with which `robot` cannot be trained.
+    ///
+    /// # Errors
+    /// [`SimError::Setting`] names the setting.
+    pub fn check(&self, robot: &Robot) -> Result<(), SimError> {
+        if self.episode_frames == 0 {
+            return Err(SimError::Setting {
+                name: "episode_frames".to_owned(),
+                expected: "at least 1".to_owned(),
+                found: "0".to_owned(),
+            });
+        }
+        for (name, limit) in [
+            ("tilt_limit", self.tilt_limit),
+            ("height_limit", self.height_limit),
+        ] {
+            if !(0.0..=1.0).contains(&limit) {
+                return Err(SimError::Setting {
+                    name: name.to_owned(),
+                    expected: "a number from 0 to 1".to_owned(),
+                    found: limit.to_string(),
+                });
+            }
+        }
+        self.randomization.check(robot)
+    }
+}

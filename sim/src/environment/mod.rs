@@ -1,0 +1,19 @@
+//! Training environments: robots that try to stand while their upper bodies follow goals (paper, section IV).
+//!
+//! A [`VecEnvironment`] is many of them, stepped together on a [`Pool`](crate::Pool). Each goes through episodes on its own; all that is
+//! random in an episode follows from one seed, drawn by the environment's number. Results therefore depend on the seed and
+//! the actions alone, not on the number of threads.
+
+mod config;
+mod episode;
+mod privileged;
+mod randomization;
+mod rewards;
+mod vec;
+
+pub use config::EnvironmentConfig;
+pub use episode::EndReason;
+pub use privileged::PrivilegedLayout;
+pub use randomization::{Hang, MassRange, Push, Randomization};
+pub use rewards::{REWARD_NAMES, REWARD_TERMS, RewardWeights};
+pub use vec::{Step, VecEnvironment};

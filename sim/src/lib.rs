@@ -18,6 +18,7 @@
 //!
 //! Frames: x forward, y left, z up, origin at the pelvis. Units: metres, radians, seconds.
 
+mod collector;
 mod collision;
 mod divergence;
 pub mod environment;
@@ -29,6 +30,7 @@ mod replay;
 #[cfg(test)]
 mod testing;
 
+pub use collector::{Collector, End, Episode, Rollout, RolloutStatistics};
 pub use collision::SelfCollision;
 pub use divergence::Divergence;
 pub use error::SimError;

@@ -16,6 +16,7 @@ mod loader;
 mod mirror;
 mod model;
 mod robot;
+mod support;
 
 pub use error::RobotError;
 pub use kinematics::{FrameKinematics, Kinematics, OutputLayout, Real};

@@ -9,6 +9,7 @@ pub mod activation;
 pub mod checkpoint;
 pub mod controller;
 pub mod error;
+pub mod filters;
 pub mod kinematics;
 pub mod linear;
 pub mod observation;

@@ -25,3 +25,4 @@ pub use robot::{
     AddedMasses, Foot, GoalNode, Joint, KEY_NODE_NAMES, KEY_NODES, KeyNodeSite, LinkSphere, Robot,
     robot_folders,
 };
+pub use support::SupportPolygon;

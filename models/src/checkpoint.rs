@@ -141,14 +141,21 @@ pub type Tensors = BTreeMap<String, Tensor>;
 /// # Errors
 /// When the file cannot be read, is no safetensors file, has no metadata of ours, or its tensors do not match its hash.
 pub fn load(path: &Path) -> Result<(CheckpointMetadata, Tensors), ModelError> {
-    let bytes = read(path)?;
+    decode(&read(path)?, path)
+}
+
+/// Reads a checkpoint from the bytes of its file; f16 tensors come back as f32. Errors call the file `origin`.
+///
+/// # Errors
+/// When the bytes are no safetensors file, have no metadata of ours, or the tensors do not match its hash.
+pub fn decode(bytes: &[u8], origin: &Path) -> Result<(CheckpointMetadata, Tensors), ModelError> {
     let damaged = |reason: String| ModelError::Checkpoint {
-        path: path.to_owned(),
+        path: origin.to_owned(),
         reason,
     };
-    let file = SafeTensors::deserialize(&bytes)
+    let file = SafeTensors::deserialize(bytes)
         .map_err(|e| damaged(format!("expected a safetensors file: {e}")))?;
-    let (_, header) = SafeTensors::read_metadata(&bytes)
+    let (_, header) = SafeTensors::read_metadata(bytes)
         .map_err(|e| damaged(format!("expected a safetensors header: {e}")))?;
     let json = header
         .metadata()
@@ -172,7 +179,7 @@ pub fn load(path: &Path) -> Result<(CheckpointMetadata, Tensors), ModelError> {
         )));
     }
     let mut tensors = Tensors::new();
-    for (name, tensor) in candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)? {
+    for (name, tensor) in candle_core::safetensors::load_buffer(bytes, &Device::Cpu)? {
         let tensor = if tensor.dtype() == DType::F16 {
             tensor.to_dtype(DType::F32)?
         } else {
@@ -205,20 +212,32 @@ fn read(path: &Path) -> Result<Vec<u8>, ModelError> {
 /// When the file cannot be written.
 pub fn save(
     path: &Path,
-    mut metadata: CheckpointMetadata,
+    metadata: CheckpointMetadata,
     tensors: &Tensors,
 ) -> Result<CheckpointMetadata, ModelError> {
+    let (metadata, bytes) = encode(metadata, tensors)?;
+    write_atomically(path, &bytes).map_err(|reason| ModelError::Io {
+        path: path.to_owned(),
+        reason,
+    })?;
+    Ok(metadata)
+}
+
+/// The bytes of a checkpoint's file, and its metadata with the hash filled in.
+///
+/// # Errors
+/// When the tensors cannot be written.
+pub fn encode(
+    mut metadata: CheckpointMetadata,
+    tensors: &Tensors,
+) -> Result<(CheckpointMetadata, Vec<u8>), ModelError> {
     let unnamed = safetensors::serialize(tensors, None).map_err(candle_core::Error::from)?;
     let file = SafeTensors::deserialize(&unnamed).map_err(candle_core::Error::from)?;
     metadata.sha256 = hash(&file);
     let json = serde_json::to_string(&metadata).map_err(candle_core::Error::wrap)?;
     let header = HashMap::from([(METADATA_KEY.to_owned(), json)]);
     let bytes = safetensors::serialize(tensors, Some(header)).map_err(candle_core::Error::from)?;
-    write_atomically(path, &bytes).map_err(|reason| ModelError::Io {
-        path: path.to_owned(),
-        reason,
-    })?;
-    Ok(metadata)
+    Ok((metadata, bytes))
 }
 
 /// Writes `bytes` next to `path` under a temporary name, then renames: a reader sees the old file or the new one.

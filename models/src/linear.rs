@@ -279,6 +279,11 @@ impl Linear {
             .reshape(dims)
     }
 
+    /// The weights, outputs × inputs, and the bias.
+    pub fn tensors(&self) -> (&Tensor, &Tensor) {
+        (&self.weight, &self.bias)
+    }
+
     /// The data type of the weights.
     pub fn dtype(&self) -> DType {
         self.weight.dtype()

@@ -137,7 +137,11 @@ impl Normalizer {
         }
     }
 
-    fn tensors(&self) -> candle_core::Result<[(String, Tensor); 2]> {
+    /// The tensors of a policy's checkpoint.
+    ///
+    /// # Errors
+    /// When a tensor cannot be made.
+    pub fn tensors(&self) -> candle_core::Result<[(String, Tensor); 2]> {
         let tensor = |name: &str, values: &[f32]| {
             Ok::<_, candle_core::Error>((name.to_owned(), Tensor::new(values, &Device::Cpu)?))
         };
@@ -195,6 +199,20 @@ impl Mlp {
         })
     }
 
+    /// The layers' tensors, named as [`Mlp::new`] names them.
+    pub fn tensors(&self) -> Tensors {
+        let layers = self.layers.iter().enumerate();
+        layers
+            .flat_map(|(i, layer)| {
+                let (weight, bias) = layer.tensors();
+                [
+                    (format!("{i}.weight"), weight.clone()),
+                    (format!("{i}.bias"), bias.clone()),
+                ]
+            })
+            .collect()
+    }
+
     /// Applies the layers to rows of inputs.
     ///
     /// # Errors
@@ -227,10 +245,46 @@ impl Policy {
     /// # Errors
     /// When the file is damaged, or was trained for another robot or another observation.
     pub fn load(weights: &Path, robot: Arc<Robot>) -> Result<Self, ModelError> {
-        let (metadata, tensors) = checkpoint::load(weights)?;
-        metadata.check(weights, &policy_metadata(&robot))?;
+        let checkpoint = checkpoint::load(weights)?;
+        Self::from_checkpoint(checkpoint, weights, robot)
+    }
+
+    /// Reads a policy from the bytes that [`encode`](Self::encode) gave, or from those of a file. Errors call them
+    /// `origin`.
+    ///
+    /// # Errors
+    /// When they are damaged, or are of another robot or another observation.
+    pub fn decode(bytes: &[u8], origin: &Path, robot: Arc<Robot>) -> Result<Self, ModelError> {
+        let checkpoint = checkpoint::decode(bytes, origin)?;
+        Self::from_checkpoint(checkpoint, origin, robot)
+    }
+
+    /// The policy as the bytes of a checkpoint in full precision: what [`decode`](Self::decode) makes of them answers the
+    /// same, bit for bit.
+    ///
+    /// # Errors
+    /// When the tensors cannot be written.
+    pub fn encode(&self) -> Result<Vec<u8>, ModelError> {
+        let mut tensors: Tensors = self.normalizer.tensors()?.into_iter().collect();
+        for (name, tensor) in self.network.tensors() {
+            tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor);
+        }
+        let metadata = CheckpointMetadata {
+            history_length: self.config.observation.history(),
+            config: serde_json::to_value(&self.config).map_err(candle_core::Error::wrap)?,
+            ..policy_metadata(&self.robot)
+        };
+        Ok(checkpoint::encode(metadata, &tensors)?.1)
+    }
+
+    fn from_checkpoint(
+        (metadata, tensors): (CheckpointMetadata, Tensors),
+        origin: &Path,
+        robot: Arc<Robot>,
+    ) -> Result<Self, ModelError> {
+        metadata.check(origin, &policy_metadata(&robot))?;
         let damaged = |reason: String| ModelError::Checkpoint {
-            path: weights.to_owned(),
+            path: origin.to_owned(),
             reason,
         };
         let config: PolicyConfig = serde_json::from_value(metadata.config.clone())
@@ -439,6 +493,11 @@ mod tests {
             }
         }
         assert!(policy.actions(&[]).unwrap().is_empty());
+        let sent = policy.encode().unwrap();
+        let received = Policy::decode(&sent, "sent".as_ref(), robot).unwrap();
+        assert_eq!(received.actions(&stacks).unwrap(), batch);
+        let error = Policy::decode(&sent[..100], "sent".as_ref(), self::robot());
+        assert!(error.unwrap_err().to_string().contains("sent"));
     }
 
     #[test]

@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod fake;
+pub mod policy;
 pub mod process;
 pub mod raw;
 
@@ -83,10 +84,19 @@ impl TestServer {
     /// # Errors
     /// When nothing can be served.
     pub fn start_real() -> anyhow::Result<Self> {
-        let settings = Settings {
-            weights: Some(weights()?),
+        Self::start_with(&weights()?, |_| {})
+    }
+
+    /// Starts a server with the robots of the checkout and the weights of a folder, its settings changed by `change`.
+    ///
+    /// # Errors
+    /// When nothing can be served.
+    pub fn start_with(weights: &Path, change: impl FnOnce(&mut Settings)) -> anyhow::Result<Self> {
+        let mut settings = Settings {
+            weights: Some(weights.to_owned()),
             ..settings()?
         };
+        change(&mut settings);
         let catalog = Catalog::load(&settings)?;
         Self::start(settings, catalog)
     }

@@ -1,0 +1,671 @@
+//! Leg targets over the wire: streams and single calls against the controller in this process, and what they refuse.
+
+use std::sync::Arc;
+
+use emp_client::{Client, Delivery, DropReason, Event, PolicyAnswer, PolicyConfig, RobotFrame};
+use emp_models::{
+    controller::{Controller, ControllerInput, ControllerOutput},
+    observation::RobotState,
+};
+use emp_proto::v1::{
+    self, PolicyFrame, PolicyObservation, Quaternion, StepPolicyRequest, StreamPolicyConfig,
+    StreamPolicyRequest, motion_service_client::MotionServiceClient,
+    stream_policy_request::Message as Request, stream_policy_response::Message as Response,
+};
+use emp_robot::Robot;
+use emp_sim::{BodyParameters, Stage, Start, Targets};
+use emp_tests::{TestServer, emp27, policy, within};
+use nalgebra::UnitQuaternion;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Status, Streaming, transport::Channel};
+use tonic_types::StatusExt as _;
+
+/// Largest difference between an answer of the server and one of this process. The orientation travels as f32, and a batch
+/// adds in another order.
+const TOLERANCE: f32 = 1e-4;
+/// Control periods of the recorded episode: longer than the history.
+const FRAMES: usize = 60;
+
+/// An episode as it was recorded, and what the controller answered to each frame.
+struct Episode {
+    frames: Vec<RobotFrame>,
+    answers: Vec<ControllerOutput>,
+}
+
+fn step(
+    controller: &Controller,
+    state: &mut emp_models::controller::ControllerState,
+    frame: &RobotFrame,
+) -> anyhow::Result<ControllerOutput> {
+    let input = ControllerInput {
+        state: RobotState {
+            joint_positions: &frame.joint_positions,
+            orientation: frame.orientation,
+        },
+        goal: &frame.goal,
+    };
+    Ok(controller.step(&mut [(state, input)])?.remove(0))
+}
+
+/// A robot in MuJoCo that follows the controller while its arms swing and its world is turned.
+fn record(controller: &Controller) -> anyhow::Result<Episode> {
+    let robot = controller.policy().robot();
+    let mut stage = Stage::new(robot)?;
+    let default: Vec<f64> = robot.joints().map(|joint| joint.default).collect();
+    let mut body = stage.place(&Start {
+        joint_positions: &default,
+        lift: 0.0,
+        parameters: BodyParameters::default(),
+    });
+    let turned = UnitQuaternion::from_euler_angles(0.0, 0.0, 2.5);
+    let mut state = controller.state();
+    let (mut frames, mut answers) = (Vec::new(), Vec::new());
+    for t in 0..FRAMES {
+        let reading = body.reading();
+        let swing = 0.3 * (0.1 * t as f32).sin();
+        let frame = RobotFrame {
+            joint_positions: reading.joint_positions.clone(),
+            orientation: turned * reading.orientation,
+            goal: goal(robot, swing),
+            reset: false,
+        };
+        let answer = step(controller, &mut state, &frame)?;
+        stage.step(
+            &mut body,
+            &Targets {
+                goal: &answer.goal,
+                legs: &answer.leg_targets,
+            },
+        );
+        frames.push(frame);
+        answers.push(answer);
+    }
+    Ok(Episode { frames, answers })
+}
+
+/// The default pose with every joint moved by `offset` toward the middle of its range where it must be, rad.
+fn goal(robot: &Robot, offset: f32) -> Vec<f32> {
+    let joints = robot.goal_joints().iter();
+    joints
+        .map(|joint| {
+            (joint.default as f32 + offset).clamp(joint.range[0] as f32, joint.range[1] as f32)
+        })
+        .collect()
+}
+
+fn rest(robot: &Robot) -> RobotFrame {
+    RobotFrame {
+        joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
+        orientation: UnitQuaternion::identity(),
+        goal: goal(robot, 0.1),
+        reset: false,
+    }
+}
+
+struct Fixture {
+    server: TestServer,
+    controller: Controller,
+    _weights: tempfile::TempDir,
+}
+
+fn fixture() -> anyhow::Result<Fixture> {
+    let weights = policy::weights()?;
+    let controller = Controller::new(policy::load(&weights)?, None);
+    Ok(Fixture {
+        server: TestServer::start_with(weights.path(), |_| {})?,
+        controller,
+        _weights: weights,
+    })
+}
+
+async fn raw_client(server: &TestServer) -> anyhow::Result<MotionServiceClient<Channel>> {
+    Ok(MotionServiceClient::connect(server.url()).await?)
+}
+
+fn assert_equal(served: &PolicyAnswer, expected: &ControllerOutput) {
+    let pairs = [
+        (&served.executable_goal, &expected.goal),
+        (&served.action, &expected.action),
+        (&served.leg_targets, &expected.leg_targets),
+    ];
+    for (served, expected) in pairs {
+        assert_eq!(served.len(), expected.len());
+        for (served, expected) in served.iter().zip(expected) {
+            assert!(
+                (served - expected).abs() <= TOLERANCE,
+                "{served} {expected}"
+            );
+        }
+    }
+}
+
+/// Streams frames one by one and gives the answers.
+async fn answers(client: &Client, frames: &[RobotFrame]) -> anyhow::Result<Vec<PolicyAnswer>> {
+    let (mut sender, mut events) = client
+        .policy_stream(PolicyConfig::for_robot("emp27"))
+        .await?;
+    assert_eq!(events.joint_names().len(), 27);
+    let mut answers = Vec::new();
+    for frame in frames {
+        sender.send(frame, None).await?;
+        match within("an answer", events.next()).await?? {
+            Some(Event::Answer(answer)) => answers.push(answer),
+            other => panic!("{other:?}"),
+        }
+    }
+    drop(sender);
+    assert_eq!(within("the end", events.next()).await??, None);
+    Ok(answers)
+}
+
+#[tokio::test]
+async fn a_stream_answers_as_the_controller_in_process() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = Client::connect(&server.url()).await?;
+    let episode = record(&controller)?;
+    let distinct = episode.answers[FRAMES - 1].action[0] - episode.answers[0].action[0];
+    assert!(distinct.abs() > 10.0 * TOLERANCE, "the history matters");
+    let served = answers(&client, &episode.frames).await?;
+    for (served, expected) in served.iter().zip(&episode.answers) {
+        assert_equal(served, expected);
+        assert_eq!(served.times.batch_size, 1);
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn reset_starts_the_episode_anew() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = Client::connect(&server.url()).await?;
+    let mut frames = record(&controller)?.frames;
+    frames.truncate(20);
+    frames[10].reset = true;
+    let served = answers(&client, &frames).await?;
+    let mut state = controller.state();
+    for (served, frame) in served.iter().zip(&frames) {
+        if frame.reset {
+            state.reset();
+        }
+        assert_equal(served, &step(&controller, &mut state, frame)?);
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn streams_of_many_robots_keep_their_histories_apart() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = Client::connect(&server.url()).await?;
+    let episode = Arc::new(record(&controller)?);
+    let streams = (0..8).map(|start| {
+        let (client, episode) = (client.clone(), Arc::clone(&episode));
+        tokio::spawn(async move { answers(&client, &episode.frames[start..]).await })
+    });
+    for (start, stream) in streams.collect::<Vec<_>>().into_iter().enumerate() {
+        let served = stream.await??;
+        let mut state = controller.state();
+        for (served, frame) in served.iter().zip(&episode.frames[start..]) {
+            assert_equal(served, &step(&controller, &mut state, frame)?);
+        }
+    }
+    Ok(())
+}
+
+fn wire_state(frame: &RobotFrame) -> v1::RobotState {
+    let q = frame.orientation.cast::<f32>();
+    v1::RobotState {
+        joint_positions: frame.joint_positions.clone(),
+        base_orientation: Some(Quaternion {
+            w: q.w,
+            x: q.i,
+            y: q.j,
+            z: q.k,
+        }),
+    }
+}
+
+fn wire_frame(number: u64, frame: &RobotFrame) -> PolicyFrame {
+    PolicyFrame {
+        header: Some(v1::FrameHeader {
+            sequence_number: number,
+            ..v1::FrameHeader::default()
+        }),
+        state: Some(wire_state(frame)),
+        goal: frame.goal.clone(),
+        reset: frame.reset,
+    }
+}
+
+#[tokio::test]
+async fn a_single_call_with_the_history_answers_as_the_stream() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let mut client = raw_client(&server).await?;
+    let episode = record(&controller)?;
+    let heading = episode.frames[0].orientation.euler_angles().2 as f32;
+    for now in [0, 5, 14, 15, FRAMES - 1] {
+        let first = now.saturating_sub(14);
+        let history = (first..=now).map(|t| PolicyObservation {
+            state: Some(wire_state(&episode.frames[t])),
+            goal: episode.frames[t].goal.clone(),
+            last_action: match t.checked_sub(1) {
+                Some(before) => episode.answers[before].action.clone(),
+                None => Vec::new(),
+            },
+        });
+        let request = StepPolicyRequest {
+            robot: "emp27".to_owned(),
+            history: history.collect(),
+            start_heading: (first > 0).then_some(heading),
+            ..StepPolicyRequest::default()
+        };
+        let response = within("an answer", client.step_policy(request)).await??;
+        let result = response.into_inner().result.expect("a result");
+        let expected = &episode.answers[now];
+        for (served, expected) in result.action.iter().zip(&expected.action) {
+            assert!(
+                (served - expected).abs() <= TOLERANCE,
+                "frame {now}: {served} {expected}"
+            );
+        }
+        assert_eq!(result.leg_targets.len(), expected.leg_targets.len());
+        assert_eq!(result.executable_goal, expected.goal);
+    }
+    Ok(())
+}
+
+fn wrong_field(status: &Status) -> String {
+    assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
+    let details = status.get_error_details();
+    details.bad_request().expect("BadRequest").field_violations[0]
+        .field
+        .clone()
+}
+
+/// Frames with one thing wrong each, and the field that is.
+fn bad_frames(good: &RobotFrame) -> Vec<(&'static str, PolicyFrame)> {
+    let with = |change: &dyn Fn(&mut PolicyFrame)| {
+        let mut frame = wire_frame(0, good);
+        change(&mut frame);
+        frame
+    };
+    let state = |change: &dyn Fn(&mut v1::RobotState)| {
+        with(&|frame| change(frame.state.as_mut().expect("a state")))
+    };
+    vec![
+        ("state", with(&|frame| frame.state = None)),
+        (
+            "state.joint_positions",
+            state(&|state| {
+                state.joint_positions.pop();
+            }),
+        ),
+        (
+            "state.joint_positions[3]",
+            state(&|state| state.joint_positions[3] = f32::NAN),
+        ),
+        (
+            "state.joint_positions[26]",
+            state(&|state| state.joint_positions[26] = 4.0),
+        ),
+        (
+            "state.base_orientation",
+            state(&|state| state.base_orientation = None),
+        ),
+        (
+            "state.base_orientation",
+            state(&|state| state.base_orientation = Some(Quaternion::default())),
+        ),
+        (
+            "state.base_orientation.y",
+            state(&|state| {
+                state.base_orientation.as_mut().expect("a quaternion").y = f32::INFINITY;
+            }),
+        ),
+        ("goal", with(&|frame| frame.goal.clear())),
+        ("goal[14]", with(&|frame| frame.goal[14] = f32::INFINITY)),
+        ("goal[0]", with(&|frame| frame.goal[0] = -10.0)),
+    ]
+}
+
+/// A stream without the client library's care.
+struct RawStream {
+    requests: mpsc::Sender<StreamPolicyRequest>,
+    responses: Streaming<v1::StreamPolicyResponse>,
+}
+
+impl RawStream {
+    async fn open(client: &MotionServiceClient<Channel>) -> anyhow::Result<Self> {
+        let (requests, outbound) = mpsc::channel(64);
+        let responses = client
+            .clone()
+            .stream_policy(ReceiverStream::new(outbound))
+            .await?
+            .into_inner();
+        Ok(Self {
+            requests,
+            responses,
+        })
+    }
+
+    async fn send(&self, message: Request) -> anyhow::Result<()> {
+        let message = Some(message);
+        Ok(self.requests.send(StreamPolicyRequest { message }).await?)
+    }
+
+    async fn next(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
+        let response = within("a message", self.responses.message()).await?;
+        Ok(response.map(|response| response.and_then(|response| response.message)))
+    }
+}
+
+fn config(robot: &str) -> StreamPolicyConfig {
+    StreamPolicyConfig {
+        robot: robot.to_owned(),
+        ..StreamPolicyConfig::default()
+    }
+}
+
+#[tokio::test]
+async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = raw_client(&server).await?;
+    let frames = record(&controller)?.frames;
+    for delivery in [Delivery::All, Delivery::Latest] {
+        let mut stream = RawStream::open(&client).await?;
+        let config = StreamPolicyConfig {
+            delivery: delivery.into(),
+            ..config("emp27")
+        };
+        stream.send(Request::Config(config)).await?;
+        let Ok(Some(Response::Started(started))) = stream.next().await? else {
+            panic!("not started")
+        };
+        assert_eq!(started.history, 15);
+        assert_eq!(started.goal_joint_names.len(), 15);
+        assert_eq!(started.leg_joint_names.len(), 12);
+        let mut state = controller.state();
+        for (frame, (field, bad)) in frames.iter().zip(bad_frames(&frames[0])) {
+            stream.send(Request::Frame(bad)).await?;
+            let Ok(Some(Response::Dropped(dropped))) = stream.next().await? else {
+                panic!("{field}: not dropped")
+            };
+            assert_eq!(
+                (dropped.reason(), dropped.field.as_str()),
+                (DropReason::Invalid, field)
+            );
+            stream.send(Request::Frame(wire_frame(7, frame))).await?;
+            let Ok(Some(Response::Result(answered))) = stream.next().await? else {
+                panic!("{field}: the stream lives on")
+            };
+            let expected = step(&controller, &mut state, frame)?;
+            for (served, expected) in answered
+                .result
+                .expect("a result")
+                .action
+                .iter()
+                .zip(&expected.action)
+            {
+                assert!((served - expected).abs() <= TOLERANCE);
+            }
+        }
+        // The `reset` of a bad frame holds for the frame after it.
+        let bad = PolicyFrame {
+            goal: Vec::new(),
+            reset: true,
+            ..wire_frame(0, &frames[0])
+        };
+        stream.send(Request::Frame(bad)).await?;
+        assert!(matches!(
+            stream.next().await?,
+            Ok(Some(Response::Dropped(_)))
+        ));
+        stream
+            .send(Request::Frame(wire_frame(8, &frames[30])))
+            .await?;
+        let Ok(Some(Response::Result(answered))) = stream.next().await? else {
+            panic!("the stream lives on")
+        };
+        let expected = step(&controller, &mut controller.state(), &frames[30])?;
+        let served = answered.result.expect("a result").action[0];
+        assert!((served - expected.action[0]).abs() <= TOLERANCE);
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn bad_configs_end_the_stream_by_field() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = raw_client(&server).await?;
+    let frame = || Request::Frame(wire_frame(0, &rest(controller.policy().robot())));
+    let cases = [
+        ("robot", vec![Request::Config(config("nobody"))]),
+        (
+            "model",
+            vec![Request::Config(StreamPolicyConfig {
+                model: "emp27-retargeter".to_owned(),
+                ..config("emp27")
+            })],
+        ),
+        (
+            "model_version",
+            vec![Request::Config(StreamPolicyConfig {
+                model_version: "0".to_owned(),
+                ..config("emp27")
+            })],
+        ),
+        (
+            "config.delivery",
+            vec![Request::Config(StreamPolicyConfig {
+                delivery: 99,
+                ..config("emp27")
+            })],
+        ),
+        ("config", vec![frame()]),
+        (
+            "config",
+            vec![
+                Request::Config(config("emp27")),
+                Request::Config(config("emp27")),
+            ],
+        ),
+    ];
+    for (field, messages) in cases {
+        let mut stream = RawStream::open(&client).await?;
+        for message in messages {
+            stream.send(message).await?;
+        }
+        let status = loop {
+            match stream.next().await? {
+                Ok(Some(Response::Started(_))) => {}
+                Ok(other) => panic!("{field}: {other:?}"),
+                Err(status) => break status,
+            }
+        };
+        assert_eq!(wrong_field(&status), field);
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn single_calls_are_refused_by_field() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let mut client = raw_client(&server).await?;
+    let good = rest(controller.policy().robot());
+    let observation = |frame: &PolicyFrame| PolicyObservation {
+        state: frame.state.clone(),
+        goal: frame.goal.clone(),
+        last_action: Vec::new(),
+    };
+    let request = |history: Vec<PolicyObservation>| StepPolicyRequest {
+        robot: "emp27".to_owned(),
+        history,
+        ..StepPolicyRequest::default()
+    };
+    let one = observation(&wire_frame(0, &good));
+    let mut cases = vec![
+        ("history".to_owned(), request(Vec::new())),
+        ("history".to_owned(), request(vec![one.clone(); 16])),
+        (
+            "history[0].last_action".to_owned(),
+            request(vec![PolicyObservation {
+                last_action: vec![0.0; 3],
+                ..one.clone()
+            }]),
+        ),
+        (
+            "history[0].last_action[2]".to_owned(),
+            request(vec![PolicyObservation {
+                last_action: [vec![0.0; 2], vec![f32::NAN; 10]].concat(),
+                ..one.clone()
+            }]),
+        ),
+        (
+            "start_heading".to_owned(),
+            StepPolicyRequest {
+                start_heading: Some(f32::NAN),
+                ..request(vec![one.clone()])
+            },
+        ),
+        (
+            "robot".to_owned(),
+            StepPolicyRequest {
+                robot: "nobody".to_owned(),
+                ..request(vec![one.clone()])
+            },
+        ),
+    ];
+    for (field, bad) in bad_frames(&good) {
+        let history = vec![one.clone(), observation(&bad)];
+        cases.push((format!("history[1].{field}"), request(history)));
+    }
+    for (field, request) in cases {
+        let status = client.step_policy(request).await.expect_err(&field);
+        assert_eq!(wrong_field(&status), field);
+    }
+    client.step_policy(request(vec![one])).await?;
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_robot_without_a_policy_says_so() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    std::fs::remove_file(policy::file(&weights))?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let client = Client::connect(&server.url()).await?;
+    let error = match client.policy_stream(PolicyConfig::for_robot("emp27")).await {
+        Ok(_) => panic!("a policy from nowhere"),
+        Err(error) => error,
+    };
+    assert_eq!(error.code(), Some(Code::InvalidArgument));
+    assert!(error.to_string().contains("robot with a policy"), "{error}");
+    assert!(
+        client
+            .models()
+            .await?
+            .iter()
+            .all(|model| model.kind() == v1::ModelKind::Retargeter)
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn policies_are_listed_beside_retargeters() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = Client::connect(&server.url()).await?;
+    let model = client.model("emp27-policy").await?;
+    assert_eq!(model.kind(), v1::ModelKind::Policy);
+    assert_eq!(model.version, controller.policy().metadata().version());
+    let robot = emp27()?;
+    let legs = robot.leg_joints().iter().map(|joint| &joint.name);
+    assert!(legs.eq(&model.joint_names));
+    let names: Vec<_> = client
+        .models()
+        .await?
+        .into_iter()
+        .map(|model| model.name)
+        .collect();
+    assert_eq!(names, ["emp27-policy", "emp27-retargeter"]);
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_lost_connection_starts_a_new_episode() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let client = Client::connect(&server.url()).await?;
+    let (mut sender, mut events) = client
+        .policy_stream(PolicyConfig {
+            delivery: Delivery::Latest,
+            ..PolicyConfig::for_robot("emp27")
+        })
+        .await?;
+    let frames = record(&controller)?.frames;
+    sender.send(&frames[0], None).await?;
+    assert!(matches!(
+        within("an answer", events.next()).await??,
+        Some(Event::Answer(_))
+    ));
+    let port = server.port();
+    server.kill();
+    let weights = _weights;
+    let mut settings = emp_server::Settings {
+        robots: Some(emp_tests::root().join("robots")),
+        weights: Some(weights.path().to_owned()),
+        ..emp_server::Settings::default()
+    };
+    settings.listen.set_port(port);
+    let catalog = emp_server::Catalog::load(&settings)?;
+    let _server = TestServer::start_on(port, settings, catalog)?;
+    loop {
+        match within("the connection", events.next()).await?? {
+            Some(Event::Reconnected { .. }) => break,
+            Some(Event::ConnectionLost { .. }) => {}
+            other => panic!("{other:?}"),
+        }
+    }
+    sender.send(&frames[40], None).await?;
+    let Some(Event::Answer(answer)) = within("an answer", events.next()).await?? else {
+        panic!("unanswered")
+    };
+    assert_ne!(answer.sequence_number, 0);
+    assert_equal(
+        &answer,
+        &step(&controller, &mut controller.state(), &frames[40])?,
+    );
+    Ok(())
+}

@@ -2,10 +2,12 @@
 //!
 //! `candle-nn`'s optimisers keep their moments to themselves, so a run that is cut off could not resume exactly.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use candle_core::{Tensor, Var, backprop::GradStore, bail};
 use candle_nn::VarMap;
+
+use crate::checkpoint::Tensors;
 
 /// Adam's settings.
 #[derive(Clone, Debug, PartialEq)]
@@ -116,8 +118,8 @@ impl Adam {
     ///
     /// # Errors
     /// When a tensor cannot be made.
-    pub fn state(&self) -> candle_core::Result<HashMap<String, Tensor>> {
-        let mut state = HashMap::new();
+    pub fn state(&self) -> candle_core::Result<Tensors> {
+        let mut state = Tensors::new();
         for (name, slot) in &self.slots {
             let device = slot.var.device();
             state.insert(
@@ -136,11 +138,7 @@ impl Adam {
     ///
     /// # Errors
     /// When a moment is missing or has another size.
-    pub fn restore(
-        &mut self,
-        state: &HashMap<String, Tensor>,
-        steps: u64,
-    ) -> candle_core::Result<()> {
+    pub fn restore(&mut self, state: &Tensors, steps: u64) -> candle_core::Result<()> {
         for (name, slot) in &mut self.slots {
             for (kind, moment) in [("mean", &mut slot.mean), ("square", &mut slot.square)] {
                 let key = format!("adam.{kind}.{name}");

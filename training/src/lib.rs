@@ -4,5 +4,7 @@
 #![forbid(unsafe_code)]
 
 pub mod log;
+pub mod policy;
 pub mod retargeter;
 pub mod run;
+pub mod variables;

@@ -1,18 +1,27 @@
 //! `emp-train`: trains the models and reports on them.
 
-use std::{path::PathBuf, process::ExitCode, sync::Arc};
+use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
 
 use anyhow::{Context as _, Result, ensure};
 use clap::{Args, Parser, Subcommand};
 use emp_models::{checkpoint::write_atomically, linear, retarget::Retargeter};
 use emp_robot::Robot;
+use emp_sim::{
+    Pool, Priority,
+    goals::{GoalClip, GoalLibrary},
+};
 use emp_training::{
+    policy::{
+        self,
+        settings::{PpoSettings, Symmetry},
+        source::LocalSource,
+    },
     retargeter::{
         data::{self, Dataset},
         report,
-        trainer::{self, Outcome, RunFiles, Settings, Trainer},
+        trainer::{self, Settings, Trainer},
     },
-    run::{self, Interrupt},
+    run::{self, Interrupt, Outcome, RunFiles},
 };
 
 /// Trains the models of the motion-filtering service, and reports on them.
@@ -34,6 +43,11 @@ enum Command {
     /// Procedural skills are always in the mix; recorded motion comes from --motions. The run's checkpoint and CSV log
     /// stand in runs/retargeter-ROBOT; Ctrl-C saves, --resume continues bit for bit.
     Retargeter(RetargeterArguments),
+    /// Train the lower-body policy by proximal policy optimisation (paper, section IV).
+    ///
+    /// Procedural skills are always in the mix; recorded motion comes from --motions, retargeted by the robot's retargeter.
+    /// The run's checkpoint and CSV log stand in runs/policy-ROBOT; Ctrl-C saves, --resume continues bit for bit.
+    Policy(PolicyArguments),
     /// Compare a trained retargeter with converged inverse kinematics on the same objective.
     RetargetReport(ReportArguments),
 }
@@ -97,6 +111,51 @@ struct RetargeterArguments {
 }
 
 #[derive(Args)]
+struct PolicyArguments {
+    #[command(flatten)]
+    robot: RobotArguments,
+    /// Folders (or files) of recorded motion: .bvh, AMASS .npz, key-node .npz.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    motions: Vec<PathBuf>,
+    /// Weights of the retargeter [default: models/weights/ROBOT-retargeter.safetensors].
+    #[arg(long, value_name = "FILE")]
+    retargeter: Option<PathBuf>,
+    /// Where the weights go, f16 safetensors.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Environment steps to learn from; a resumed run may be given more.
+    #[arg(long, default_value_t = 20_000_000)]
+    steps: u64,
+    /// Seed of weights, episodes and procedural skills.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Environments stepped side by side.
+    #[arg(long, default_value_t = 256)]
+    environments: usize,
+    /// Control periods collected between two updates.
+    #[arg(long, default_value_t = 32)]
+    horizon: usize,
+    /// Procedural clips in the mix.
+    #[arg(long, default_value_t = 1000)]
+    procedural_clips: usize,
+    /// How left–right symmetry is used.
+    #[arg(long, value_enum, default_value_t = Symmetry::None)]
+    symmetry: Symmetry,
+    /// Continue the run from its checkpoint.
+    #[arg(long)]
+    resume: bool,
+    /// Folder of the run's checkpoint and log [default: runs/policy-ROBOT].
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+    /// Seconds between two checkpoints.
+    #[arg(long, default_value_t = 120)]
+    save_every: u64,
+    /// Threads for physics and learning; the weights do not depend on it.
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+}
+
+#[derive(Args)]
 struct ReportArguments {
     #[command(flatten)]
     robot: RobotArguments,
@@ -119,6 +178,7 @@ fn main() -> Result<ExitCode> {
     unsafe { single_thread_element_wise_ops() };
     match Cli::parse().command {
         Command::Retargeter(arguments) => train_retargeter(&arguments),
+        Command::Policy(arguments) => train_policy(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),
     }
 }
@@ -143,7 +203,7 @@ fn train_retargeter(arguments: &RetargeterArguments) -> Result<ExitCode> {
         .run
         .clone()
         .unwrap_or_else(|| PathBuf::from(format!("runs/retargeter-{}", robot.name())));
-    let save_every = std::time::Duration::from_secs(arguments.save_every);
+    let save_every = Duration::from_secs(arguments.save_every);
     let files = RunFiles {
         folder,
         weights: arguments.out.clone(),
@@ -192,14 +252,103 @@ fn train_retargeter(arguments: &RetargeterArguments) -> Result<ExitCode> {
     }
 }
 
-fn report_retargeter(arguments: &ReportArguments) -> Result<ExitCode> {
+fn train_policy(arguments: &PolicyArguments) -> Result<ExitCode> {
+    ensure!(
+        arguments.environments > 0 && arguments.horizon > 0 && arguments.steps > 0,
+        "--environments, --horizon and --steps must be at least 1"
+    );
     let robot = arguments.robot.load()?;
-    let weights = arguments.weights.clone().unwrap_or_else(|| {
+    let folder = arguments
+        .run
+        .clone()
+        .unwrap_or_else(|| PathBuf::from(format!("runs/policy-{}", robot.name())));
+    let files = RunFiles {
+        folder,
+        weights: arguments.out.clone(),
+        save_every: Duration::from_secs(arguments.save_every),
+    };
+    let settings = policy::Settings {
+        seed: arguments.seed,
+        environments: arguments.environments,
+        horizon: arguments.horizon,
+        procedural_clips: arguments.procedural_clips,
+        ppo: PpoSettings {
+            symmetry: arguments.symmetry,
+            ..PpoSettings::default()
+        },
+        ..policy::Settings::default()
+    };
+    let checkpoint = files.checkpoint();
+    ensure!(
+        arguments.resume || !checkpoint.exists(),
+        "{} exists: continue with --resume, or remove it, or name another --run",
+        checkpoint.display()
+    );
+    let (library, data) = goal_library(arguments, &robot)?;
+    let pool = Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?);
+    let mut source = LocalSource::new(&robot, &pool, &settings, Arc::new(library))?;
+    let mut trainer = if arguments.resume {
+        policy::Trainer::resume(robot, settings, arguments.threads, &checkpoint, &mut source)?
+    } else {
+        policy::Trainer::new(robot, settings, arguments.threads)?
+    };
+    let interrupt = Interrupt::listen()?;
+    let outcome = policy::train(
+        &mut trainer,
+        arguments.steps,
+        &mut source,
+        &data,
+        &files,
+        &interrupt,
+    )?;
+    eprintln!("{}", trainer.times());
+    match outcome {
+        Outcome::Finished => {
+            eprintln!("wrote {}", files.weights.display());
+            Ok(ExitCode::SUCCESS)
+        }
+        Outcome::Interrupted => {
+            eprintln!(
+                "interrupted at step {}; continue with --resume",
+                trainer.steps()
+            );
+            Ok(ExitCode::from(3))
+        }
+    }
+}
+
+fn goal_library(
+    arguments: &PolicyArguments,
+    robot: &Arc<Robot>,
+) -> Result<(GoalLibrary, serde_json::Value)> {
+    let weights = retargeter_weights(arguments.retargeter.as_ref(), robot);
+    let retargeter = Retargeter::load(&weights, Arc::clone(robot))?;
+    let (library, data) = policy::data::library(
+        &retargeter,
+        &arguments.motions,
+        arguments.procedural_clips,
+        arguments.seed,
+        arguments.threads,
+    )?;
+    let frames: usize = library.clips().map(GoalClip::len).sum();
+    eprintln!("{} clips of goals, {frames} frames", library.clips().len());
+    Ok((library, data))
+}
+
+/// The weights that were named, or the robot's shipped ones.
+fn retargeter_weights(named: Option<&PathBuf>, robot: &Robot) -> PathBuf {
+    let shipped = || {
         PathBuf::from(format!(
             "models/weights/{}-retargeter.safetensors",
             robot.name()
         ))
-    });
+    };
+    named.cloned().unwrap_or_else(shipped)
+}
+
+fn report_retargeter(arguments: &ReportArguments) -> Result<ExitCode> {
+    let robot = arguments.robot.load()?;
+    let weights = retargeter_weights(arguments.weights.as_ref(), &robot);
     let retargeter = Retargeter::load(&weights, robot)?;
     let clips = if arguments.motions.is_empty() {
         let library = emp_motion::skills::library(1, 60);

@@ -1,12 +1,13 @@
 //! What every trainer shares: interruption, progress, and the facts of a run.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     process::Command,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
+    time::Duration,
 };
 
 use anyhow::{Context as _, Result};
@@ -39,6 +40,37 @@ impl Interrupt {
     }
 }
 
+/// Where a run keeps its state, and what it leaves.
+pub struct RunFiles {
+    /// Folder of the checkpoint and the log.
+    pub folder: PathBuf,
+    /// The weights for serving.
+    pub weights: PathBuf,
+    /// Time between two checkpoints.
+    pub save_every: Duration,
+}
+
+impl RunFiles {
+    /// The run's checkpoint.
+    pub fn checkpoint(&self) -> PathBuf {
+        self.folder.join("checkpoint.safetensors")
+    }
+
+    /// The run's log.
+    pub fn log(&self) -> PathBuf {
+        self.folder.join("log.csv")
+    }
+}
+
+/// How a run ended.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// All steps are done and the weights are written.
+    Finished,
+    /// Interrupted; the checkpoint is written.
+    Interrupted,
+}
+
 /// A progress bar on stderr, hidden where stderr is no terminal.
 pub fn progress(steps: u64, done: u64) -> ProgressBar {
     let style = ProgressStyle::with_template(
@@ -54,7 +86,7 @@ pub fn progress(steps: u64, done: u64) -> ProgressBar {
 /// A spinner on stderr for work of unknown length, hidden where stderr is no terminal.
 pub fn spinner() -> ProgressBar {
     let bar = ProgressBar::new_spinner();
-    bar.enable_steady_tick(std::time::Duration::from_millis(100));
+    bar.enable_steady_tick(Duration::from_millis(100));
     bar
 }
 

@@ -1,10 +1,6 @@
 //! The training loop of the retargeting network: checkpoints, resumption, codebook upkeep.
 
-use std::{
-    path::{Path, PathBuf},
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{path::Path, sync::Arc, time::Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use candle_core::{DType, Device, Tensor};
@@ -26,7 +22,8 @@ use super::{
 };
 use crate::{
     log::CsvLog,
-    run::{self, Interrupt},
+    run::{self, Interrupt, Outcome, RunFiles},
+    variables,
 };
 
 /// Kind of the checkpoints in a run's folder, which hold the optimiser's state too.
@@ -81,7 +78,7 @@ impl Trainer {
         let config = NetworkConfig::default();
         let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
         let network = RetargetNetwork::new(&config, &robot, &builder)?;
-        initialise(&vars, settings.seed)?;
+        variables::initialise(&vars, &mut ChaCha8Rng::seed_from_u64(settings.seed))?;
         let adam = Adam::new(&vars, AdamConfig::default())?;
         let loss = Loss::new(&robot)?;
         let usage = vec![0.0; network.codes()];
@@ -114,9 +111,7 @@ impl Trainer {
             saved.settings
         );
         let mut trainer = Self::new(robot, settings)?;
-        let tensors = tensors.into_iter().collect();
-        trainer
-            .set_vars(&tensors)
+        variables::restore(&trainer.vars, &tensors)
             .with_context(|| format!("{}", path.display()))?;
         trainer.adam.restore(&tensors, saved.step)?;
         let Some(usage) = tensors.get("usage") else {
@@ -137,36 +132,12 @@ impl Trainer {
     /// # Errors
     /// When the variables' lock is poisoned.
     pub fn weights(&self) -> Result<Tensors> {
-        let vars = self
-            .vars
-            .data()
-            .lock()
-            .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
-        Ok(vars
-            .iter()
-            .map(|(name, var)| (name.clone(), var.as_detached_tensor()))
-            .collect())
+        variables::values(&self.vars)
     }
 
     /// The network as it is now.
     pub fn network(&self) -> &RetargetNetwork {
         &self.network
-    }
-
-    fn set_vars(&self, tensors: &std::collections::HashMap<String, Tensor>) -> Result<()> {
-        let vars = self
-            .vars
-            .data()
-            .lock()
-            .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
-        for (name, var) in vars.iter() {
-            let tensor = tensors
-                .get(name)
-                .with_context(|| format!("no tensor `{name}`"))?;
-            var.set(tensor)
-                .with_context(|| format!("tensor `{name}`"))?;
-        }
-        Ok(())
     }
 
     /// Writes network, optimiser and progress.
@@ -261,11 +232,7 @@ impl Trainer {
         }
         let (rows, width) = latent.dims2()?;
         let latent = latent.flatten_all()?.to_vec1::<f32>()?;
-        let vars = self
-            .vars
-            .data()
-            .lock()
-            .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
+        let vars = variables::lock(&self.vars)?;
         let codebook = vars.get("codebook").context("no variable `codebook`")?;
         let mut values = codebook.flatten_all()?.to_vec1::<f32>()?;
         for code in &codes {
@@ -297,34 +264,6 @@ struct Progress {
     step: u64,
 }
 
-/// Candle draws initial weights from a generator that cannot be seeded on the CPU; they are drawn anew here, uniformly
-/// within `±1/√inputs`.
-fn initialise(vars: &VarMap, seed: u64) -> Result<()> {
-    let vars = vars
-        .data()
-        .lock()
-        .map_err(|_| anyhow::anyhow!("the variables' lock is poisoned"))?;
-    let mut names: Vec<&String> = vars.keys().collect();
-    names.sort();
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    for name in names {
-        let var = &vars[name];
-        let weight = name
-            .strip_suffix("bias")
-            .map(|stem| format!("{stem}weight"));
-        let shape = weight
-            .and_then(|weight| vars.get(&weight))
-            .unwrap_or(var)
-            .dims();
-        let bound = 1.0 / (*shape.last().unwrap_or(&1) as f32).sqrt();
-        let values: Vec<f32> = (0..var.elem_count())
-            .map(|_| rng.random_range(-bound..bound))
-            .collect();
-        var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu)?)?;
-    }
-    Ok(())
-}
-
 fn step_rng(seed: u64, step: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     // Stream 0 drew the initial weights.
@@ -344,37 +283,6 @@ pub fn perplexity(indices: &[u32], codes: usize) -> f64 {
         .filter(|count| **count > 0)
         .map(|count| *count as f64 / total);
     shares.map(|p| -p * p.ln()).sum::<f64>().exp()
-}
-
-/// Where a run keeps its state, and what it leaves.
-pub struct RunFiles {
-    /// Folder of the checkpoint and the log.
-    pub folder: PathBuf,
-    /// The weights for serving.
-    pub weights: PathBuf,
-    /// Time between two checkpoints.
-    pub save_every: Duration,
-}
-
-impl RunFiles {
-    /// The run's checkpoint.
-    pub fn checkpoint(&self) -> PathBuf {
-        self.folder.join("checkpoint.safetensors")
-    }
-
-    /// The run's log.
-    pub fn log(&self) -> PathBuf {
-        self.folder.join("log.csv")
-    }
-}
-
-/// How a run ended.
-#[derive(Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// All steps are done and the weights are written.
-    Finished,
-    /// Interrupted; the checkpoint is written.
-    Interrupted,
 }
 
 /// Runs the trainer to its end or to an interruption, saving now and then.

@@ -1,0 +1,16 @@
+//! The lower-body policy: proximal policy optimisation with an asymmetric actor–critic (paper, section IV).
+
+pub mod curriculum;
+pub mod data;
+pub mod learner;
+pub mod moments;
+pub mod network;
+pub mod objective;
+pub mod returns;
+pub mod settings;
+pub mod source;
+pub mod symmetry;
+pub mod trainer;
+
+pub use settings::Settings;
+pub use trainer::{Trainer, train};

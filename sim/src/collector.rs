@@ -126,6 +126,20 @@ impl Collector {
         log_std: &[f32],
         horizon: usize,
     ) -> Result<Rollout, SimError> {
+        self.collect_unless(policy, log_std, horizon, || false)
+    }
+
+    /// [`collect`](Self::collect), but asks before every control period whether to stop; then the rollout is as long as it got.
+    ///
+    /// # Errors
+    /// As [`collect`](Self::collect).
+    pub fn collect_unless(
+        &mut self,
+        policy: &Policy,
+        log_std: &[f32],
+        horizon: usize,
+        mut stop: impl FnMut() -> bool,
+    ) -> Result<Rollout, SimError> {
         self.check(policy, log_std)?;
         let std: Vec<f32> = log_std.iter().map(|log| log.exp()).collect();
         let mut rollout = Rollout {
@@ -136,6 +150,10 @@ impl Collector {
         let mut terms = [0.0; REWARD_TERMS];
         let mut features = Vec::new();
         for t in 0..horizon {
+            if stop() {
+                rollout.horizon = t;
+                break;
+            }
             let observations = self.environments.observations();
             policy.config().map_history(observations, &mut features);
             let means = policy.actions_from_features(features.clone())?;
@@ -247,4 +265,118 @@ fn explore(noise: &mut [ChaCha8Rng], means: &[f32], std: &[f32]) -> Vec<f32> {
         }
     }
     actions
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::environment::{EnvironmentConfig, REWARD_NAMES};
+    use crate::testing::{emp27, goal_library, policy};
+    use crate::{Pool, Priority};
+
+    fn collector(count: u64, threads: usize) -> Collector {
+        let robot = emp27();
+        let pool = Arc::new(Pool::new(&robot, threads, Priority::Normal).unwrap());
+        let library = Arc::new(goal_library(&robot));
+        let config = EnvironmentConfig {
+            episode_frames: 12,
+            ..EnvironmentConfig::default()
+        };
+        let environments = VecEnvironment::new(robot, pool, config, library, 0..count, 9).unwrap();
+        Collector::new(environments, 0, 9)
+    }
+
+    #[test]
+    fn rows_of_a_rollout_belong_together() {
+        let mut collector = collector(6, 2);
+        let policy = policy(collector.environments().robot());
+        let log_std = [-1.0; 12];
+        let (n, t) = (6, 30);
+        let first = policy.features(collector.environments().observations());
+        let privileged = collector.environments().privileged().to_vec();
+        let rollout = collector.collect(&policy, &log_std, t).unwrap();
+        let width = collector.environments().privileged_layout().width();
+        assert_eq!((rollout.environments, rollout.horizon), (n, t));
+        assert_eq!(rollout.features.len(), t * n * policy.config().features());
+        assert_eq!(rollout.features[..first.len()], first);
+        assert_eq!(rollout.privileged.len(), t * n * width);
+        assert_eq!(rollout.privileged[..privileged.len()], privileged);
+        assert_eq!(
+            rollout.last_privileged,
+            collector.environments().privileged()
+        );
+        assert_eq!(rollout.actions.len(), t * n * 12);
+        assert_eq!(
+            rollout.means,
+            policy
+                .actions_from_features(rollout.features.clone())
+                .unwrap()
+        );
+        assert_eq!((rollout.rewards.len(), rollout.ends.len()), (t * n, t * n));
+        let of = |end: End| rollout.ends.iter().filter(|&&e| e == end).count();
+        assert_eq!(of(End::TimedOut), rollout.timed_out_privileged.len());
+        assert!(of(End::TimedOut) > 6);
+        assert_eq!(t * n - of(End::None), rollout.statistics.episodes.len());
+        for (row, privileged) in &rollout.timed_out_privileged {
+            assert_eq!(rollout.ends[*row], End::TimedOut);
+            assert_eq!(privileged.len(), width);
+            // The end of the old episode, not the start of the new one.
+            let next = (row + n) * width..(row + n + 1) * width;
+            assert!(
+                rollout
+                    .privileged
+                    .get(next)
+                    .is_none_or(|next| next != privileged)
+            );
+        }
+        let deviations = rollout.actions.iter().zip(&rollout.means);
+        let variance: f32 = deviations.map(|(a, mean)| (a - mean).powi(2)).sum();
+        let std = (variance / (t * n * 12) as f32).sqrt();
+        assert!((std / (-1.0_f32).exp() - 1.0).abs() < 0.05, "{std}");
+        let terms = &rollout.statistics.reward_terms;
+        assert_eq!(terms.len(), REWARD_NAMES.len());
+        let mean: f64 = rollout.rewards.iter().map(|&r| f64::from(r)).sum::<f64>() / (t * n) as f64;
+        assert!((terms.iter().sum::<f64>() * 0.02 - mean).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_restored_collector_goes_on_bit_for_bit_at_any_number_of_threads() {
+        let mut original = collector(5, 2);
+        let policy = policy(original.environments().robot());
+        original.set_curriculum(0.5, 1.0);
+        original.collect(&policy, &[-1.0; 12], 7).unwrap();
+        let snapshot = original.snapshot().unwrap();
+        let expected = original.collect(&policy, &[-1.0; 12], 20).unwrap();
+        for threads in [1, 3] {
+            let mut restored = collector(5, threads);
+            restored.set_curriculum(0.5, 1.0);
+            restored.restore(&snapshot).unwrap();
+            assert!(restored.collect(&policy, &[-1.0; 12], 20).unwrap() == expected);
+        }
+        let stored = postcard::to_stdvec(&expected).unwrap();
+        assert!(postcard::from_bytes::<Rollout>(&stored).unwrap() == expected);
+        let error = collector(4, 1).restore(&snapshot).unwrap_err().to_string();
+        assert!(
+            error.contains("expected 4 environments, found 5"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused() {
+        let mut collector = collector(2, 1);
+        let policy = policy(collector.environments().robot());
+        let error = collector
+            .collect(&policy, &[0.0; 3], 1)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("log_std: expected 12 numbers, found 3"),
+            "{error}"
+        );
+        let nothing = collector.collect(&policy, &[0.0; 12], 0).unwrap();
+        assert!(nothing.rewards.is_empty() && nothing.last_privileged.len() > 2);
+    }
 }

@@ -9,11 +9,14 @@ mod episode;
 mod privileged;
 mod randomization;
 mod rewards;
+#[cfg(test)]
+mod tests;
 mod vec;
 
 pub use config::EnvironmentConfig;
 pub use episode::EndReason;
 pub use privileged::PrivilegedLayout;
 pub use randomization::{Hang, MassRange, Push, Randomization};
+pub(crate) use randomization::{leg_targets, within};
 pub use rewards::{REWARD_NAMES, REWARD_TERMS, RewardWeights};
 pub use vec::{Step, VecEnvironment};

@@ -51,11 +51,19 @@ impl Default for BodyParameters {
 impl BodyParameters {
     /// Whether the model is the robot's own: all is nominal but perhaps the delay.
     pub(crate) fn leave_the_model(&self) -> bool {
-        let without_delay = Self {
-            motor_delay: 0.0,
-            ..self.clone()
-        };
-        without_delay == Self::default()
+        let factors = [
+            &self.link_mass,
+            &self.link_inertia,
+            &self.p_gain,
+            &self.d_gain,
+            &self.motor_torque,
+            &self.motor_damping,
+        ];
+        let [left, right] = self.hand_mass;
+        let [x, y, z] = self.base_com;
+        self.friction == 1.0
+            && [self.base_mass, left, right, x, y, z] == [0.0; 6]
+            && factors.into_iter().flatten().all(|&factor| factor == 1.0)
     }
 }
 

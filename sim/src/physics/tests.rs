@@ -433,6 +433,7 @@ fn nominal_bodies_share_their_fields() {
         let mut stage = Stage::new(robot).unwrap();
         let parameters = BodyParameters {
             motor_delay: 0.004,
+            p_gain: vec![1.0; 27],
             ..BodyParameters::default()
         };
         let bodies = [parameters, BodyParameters::default()].map(|p| place(robot, &mut stage, p));

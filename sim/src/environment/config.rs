@@ -1,10 +1,12 @@
 //! Settings of the training environments.
 
+use emp_models::observation::projected_gravity;
+use emp_models::observation::projected_gravity;
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
-use super::{Randomization, RewardWeights};
-use crate::SimError;
+use super::{EndReason, Randomization, RewardWeights};
+use crate::{Reading, SimError};
 
 /// Settings of the training environments. The default is the paper's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,6 +37,21 @@ impl Default for EnvironmentConfig {
 }
 
 impl EnvironmentConfig {
+    /// Why an episode with this reading ends before its time, if it does: the robot fell, or its simulation diverged.
+    pub fn fall(&self, robot: &Robot, reading: &Reading) -> Option<EndReason> {
+        if let Some(divergence) = reading.divergence {
+            return Some(EndReason::Diverged(divergence));
+        }
+        let [x, y, _] = projected_gravity(&reading.orientation);
+        if x.abs().max(y.abs()) > self.tilt_limit {
+            Some(EndReason::Tilted)
+        } else if reading.position.z < self.height_limit * robot.standing_height() {
+            Some(EndReason::Sank)
+        } else {
+            None
+        }
+    }
+
     /// Refuses settings with which `robot` cannot be trained.
     ///
     /// # Errors
@@ -60,5 +77,20 @@ impl EnvironmentConfig {
             }
         }
         self.randomization.check(robot)
+    }
+
+    /// Why an episode with this reading ends, if it does.
+    pub(crate) fn fall(&self, reading: &Reading, standing_height: f64) -> Option<EndReason> {
+        if let Some(divergence) = reading.divergence {
+            return Some(EndReason::Diverged(divergence));
+        }
+        let [x, y, _] = projected_gravity(&reading.orientation);
+        if x.abs().max(y.abs()) > self.tilt_limit {
+            Some(EndReason::Tilted)
+        } else if reading.position.z < self.height_limit * standing_height {
+            Some(EndReason::Sank)
+        } else {
+            None
+        }
     }
 }

@@ -3,15 +3,14 @@
 use std::fmt;
 use std::sync::Arc;
 
-use emp_models::observation::{HISTORY, History, ObservationLayout, RobotState, projected_gravity};
+use emp_models::observation::{HISTORY, History, ObservationLayout, RobotState};
 use emp_robot::Robot;
-use nalgebra::Vector3;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::privileged::{AHEAD, PrivilegedState};
-use super::randomization::within;
+use super::randomization::{leg_targets, within};
 use super::rewards::Outcome;
 use super::{EnvironmentConfig, PrivilegedLayout, REWARD_TERMS, Randomization};
 use crate::goals::{GoalLibrary, GoalStream};
@@ -93,21 +92,6 @@ impl Setting {
             robot,
             config,
             library,
-        }
-    }
-
-    /// Why an episode with this reading ends, if it does.
-    pub(super) fn fall(&self, reading: &Reading) -> Option<EndReason> {
-        if let Some(divergence) = reading.divergence {
-            return Some(EndReason::Diverged(divergence));
-        }
-        let [x, y, _] = projected_gravity(&reading.orientation);
-        if x.abs().max(y.abs()) > self.config.tilt_limit {
-            Some(EndReason::Tilted)
-        } else if reading.position.z < self.config.height_limit * self.standing_height {
-            Some(EndReason::Sank)
-        } else {
-            None
         }
     }
 }
@@ -247,7 +231,7 @@ impl Environment {
         self.age += 1;
         self.left = self.left.saturating_sub(1);
         let time_out = (self.left == 0).then_some(EndReason::TimedOut);
-        let end = setting.fall(self.body.reading()).or(time_out);
+        let end = setting.config.fall(&setting.robot, self.body.reading()).or(time_out);
         self.judge(setting, action, slots);
         *slots.end = end;
         *slots.length = self.age;
@@ -295,22 +279,13 @@ impl Environment {
             return;
         }
         self.until_push = interval.saturating_sub(1);
-        let rng = &mut self.rng;
-        let mut draw = |limit: f64| within(Some([-limit, limit]), 0.0, rng);
-        let linear = Vector3::new(draw(push.linear), draw(push.linear), 0.0);
-        let angular = Vector3::from_fn(|_, _| draw(push.angular));
+        let [linear, angular] = push.draw(&mut self.rng);
         self.body.push(linear, angular);
     }
 
     fn set_targets(&mut self, setting: &Setting, action: &[f32]) {
-        let scale = setting.robot.action_scale();
-        let range = setting.randomization.action;
-        let legs = self.legs.iter_mut().zip(action);
-        for ((target, &action), joint) in legs.zip(setting.robot.leg_joints()) {
-            let noise = within(range, 1.0, &mut self.rng);
-            let angle = joint.default + scale * noise * f64::from(action);
-            *target = angle.clamp(joint.range[0], joint.range[1]) as f32;
-        }
+        let noise = setting.randomization.action;
+        leg_targets(&setting.robot, action, noise, &mut self.rng, &mut self.legs);
     }
 
     /// Writes the reward of the control period that just ended: the weighted terms' sum times its length.

@@ -1,6 +1,7 @@
 //! Domain randomisation (paper, table "Domain Randomization").
 
 use emp_robot::Robot;
+use nalgebra::Vector3;
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +39,15 @@ pub struct Push {
     pub linear: f64,
     /// Largest change of the angular velocity about each axis, rad/s.
     pub angular: f64,
+}
+
+impl Push {
+    /// Draws the jumps of one push: of the linear velocity (world frame, m/s) and of the angular one (base frame, rad/s).
+    pub(crate) fn draw(&self, rng: &mut impl Rng) -> [Vector3<f64>; 2] {
+        let mut draw = |limit: f64| within(Some([-limit, limit]), 0.0, rng);
+        let linear = Vector3::new(draw(self.linear), draw(self.linear), 0.0);
+        [linear, Vector3::from_fn(|_, _| draw(self.angular))]
+    }
 }
 
 /// Episodes that start above the floor.
@@ -289,7 +299,22 @@ impl Randomization {
 }
 
 /// A number from `range`, or `nominal` where there is none; draws one from `rng` either way.
-pub(super) fn within(range: Option<[f64; 2]>, nominal: f64, rng: &mut impl Rng) -> f64 {
+pub(crate) fn within(range: Option<[f64; 2]>, nominal: f64, rng: &mut impl Rng) -> f64 {
     let share: f64 = rng.random();
     range.map_or(nominal, |[low, high]| low + share * (high - low))
+}
+
+/// Leg targets (rad, inside the joints' ranges) of an action (policy units), each number of it times a factor from `noise`.
+pub(crate) fn leg_targets(
+    robot: &Robot,
+    action: &[f32],
+    noise: Option<[f64; 2]>,
+    rng: &mut impl Rng,
+    legs: &mut [f32],
+) {
+    for ((target, &action), joint) in legs.iter_mut().zip(action).zip(robot.leg_joints()) {
+        let factor = within(noise, 1.0, rng);
+        let angle = joint.default + robot.action_scale() * factor * f64::from(action);
+        *target = angle.clamp(joint.range[0], joint.range[1]) as f32;
+    }
 }

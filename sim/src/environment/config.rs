@@ -1,7 +1,6 @@
 //! Settings of the training environments.
 
 use emp_models::observation::projected_gravity;
-use emp_models::observation::projected_gravity;
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
@@ -37,21 +36,6 @@ impl Default for EnvironmentConfig {
 }
 
 impl EnvironmentConfig {
-    /// Why an episode with this reading ends before its time, if it does: the robot fell, or its simulation diverged.
-    pub fn fall(&self, robot: &Robot, reading: &Reading) -> Option<EndReason> {
-        if let Some(divergence) = reading.divergence {
-            return Some(EndReason::Diverged(divergence));
-        }
-        let [x, y, _] = projected_gravity(&reading.orientation);
-        if x.abs().max(y.abs()) > self.tilt_limit {
-            Some(EndReason::Tilted)
-        } else if reading.position.z < self.height_limit * robot.standing_height() {
-            Some(EndReason::Sank)
-        } else {
-            None
-        }
-    }
-
     /// Refuses settings with which `robot` cannot be trained.
     ///
     /// # Errors
@@ -79,8 +63,9 @@ impl EnvironmentConfig {
         self.randomization.check(robot)
     }
 
-    /// Why an episode with this reading ends, if it does.
-    pub(crate) fn fall(&self, reading: &Reading, standing_height: f64) -> Option<EndReason> {
+    /// Why an episode with this reading ends before its time, if it does: the robot fell, or its simulation diverged. The
+    /// standing height is the robot's, metres.
+    pub fn fall(&self, reading: &Reading, standing_height: f64) -> Option<EndReason> {
         if let Some(divergence) = reading.divergence {
             return Some(EndReason::Diverged(divergence));
         }

@@ -94,6 +94,11 @@ impl Setting {
             library,
         }
     }
+
+    /// Why an episode with this reading ends, if it does.
+    pub(super) fn fall(&self, reading: &Reading) -> Option<EndReason> {
+        self.config.fall(reading, self.standing_height)
+    }
 }
 
 /// Where one environment's share of the batch goes.
@@ -231,7 +236,7 @@ impl Environment {
         self.age += 1;
         self.left = self.left.saturating_sub(1);
         let time_out = (self.left == 0).then_some(EndReason::TimedOut);
-        let end = setting.config.fall(&setting.robot, self.body.reading()).or(time_out);
+        let end = setting.fall(self.body.reading()).or(time_out);
         self.judge(setting, action, slots);
         *slots.end = end;
         *slots.length = self.age;

@@ -71,6 +71,21 @@ impl GoalClip {
         Ok(clip)
     }
 
+    /// A clip of goals that are known to be some.
+    pub(super) fn from_angles(
+        name: String,
+        source: Source,
+        joints: usize,
+        angles: Vec<f32>,
+    ) -> Self {
+        Self {
+            name,
+            source,
+            joints,
+            angles,
+        }
+    }
+
     /// What `retargeter` makes of human motion: a clip of goals for each clip, in order, on `threads` threads.
     ///
     /// # Errors

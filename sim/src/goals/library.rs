@@ -108,6 +108,22 @@ impl GoalLibrary {
         GoalStream::new(self, seed, difficulty)
     }
 
+    /// The first goals of a stream as a clip: for tests that last longer than the clips do. Its source counts as
+    /// procedural, whatever the pieces are.
+    pub fn sample(&self, seed: u64, difficulty: f32, frames: usize) -> GoalClip {
+        let mut stream = self.stream(seed, difficulty);
+        let mut angles = vec![0.0; frames.max(1) * self.joints()];
+        for goal in angles.chunks_exact_mut(self.joints()) {
+            stream.next(self, goal);
+        }
+        GoalClip::from_angles(
+            format!("stream-{seed}"),
+            Source::Procedural,
+            self.joints(),
+            angles,
+        )
+    }
+
     /// Draws a piece of a clip.
     pub(super) fn draw(&self, rng: &mut impl Rng, difficulty: f32) -> Piece {
         let group = &self.groups[rng.random_range(0..self.groups.len())];

@@ -1,0 +1,319 @@
+use std::cell::Cell;
+use std::sync::Arc;
+
+use emp_models::controller::Controller;
+use emp_models::filters;
+use emp_robot::Robot;
+
+use super::*;
+use crate::Priority;
+use crate::testing::{emp27, goal_library, policy};
+
+fn pool(robot: &Robot, threads: usize) -> Pool {
+    Pool::new(robot, threads, Priority::Normal).unwrap()
+}
+
+/// A controller whose policy has small random weights: the robot stands for a while.
+fn controller(robot: &Arc<Robot>, filter: &str) -> Controller {
+    let filter = filters::by_name(filter, robot).unwrap();
+    Controller::new(Arc::new(policy(robot)), filter)
+}
+
+/// Pieces of swinging arms, the first half as if recorded.
+fn clips(robot: &Robot, count: usize, frames: usize) -> Vec<GoalClip> {
+    let library = goal_library(robot);
+    let clip = |i: usize| {
+        let mut clip = library.sample(i as u64, 1.0, frames);
+        if i < count / 2 {
+            clip.source = Source::Recorded;
+        }
+        clip
+    };
+    (0..count).map(clip).collect()
+}
+
+fn run(robot: &Arc<Robot>, threads: usize, settings: &EvaluationSettings) -> Evaluation {
+    let clips = clips(robot, 5, 40);
+    let controller = controller(robot, "decoupled");
+    evaluate(
+        &pool(robot, threads),
+        &controller,
+        &clips,
+        settings,
+        &mut (),
+    )
+    .unwrap()
+}
+
+/// Falls soon: heavy hands, kicked hard and often.
+fn hard() -> EvaluationSettings {
+    EvaluationSettings {
+        seed: 11,
+        episodes: Some(70),
+        push: Some(Kick {
+            speed: 2.0,
+            interval: 0.4,
+        }),
+        hand_load: Some([2.0, 3.0]),
+        ..EvaluationSettings::default()
+    }
+}
+
+#[test]
+fn the_same_request_gives_the_same_bits_on_any_number_of_threads() {
+    let robot = emp27();
+    for settings in [
+        hard(),
+        EvaluationSettings {
+            conditions: Conditions::Full,
+            episodes: Some(70),
+            ..EvaluationSettings::default()
+        },
+    ] {
+        let [one, two, three] = [1, 2, 3].map(|threads| run(&robot, threads, &settings));
+        assert_eq!(one, two);
+        assert_eq!(one, three);
+        assert_eq!((one.results.len(), one.complete), (70, true));
+        let other = EvaluationSettings {
+            seed: settings.seed + 1,
+            ..settings
+        };
+        assert_ne!(one.results, run(&robot, 2, &other).results);
+    }
+}
+
+#[test]
+fn an_episode_depends_on_its_own_number_alone() {
+    let robot = emp27();
+    let all = run(&robot, 2, &hard());
+    let few = run(
+        &robot,
+        2,
+        &EvaluationSettings {
+            episodes: Some(3),
+            ..hard()
+        },
+    );
+    for (few, all) in few.results.iter().zip(&all.results) {
+        // The batch's size decides the last bits of the policy's answer.
+        assert_eq!((few.episode, &few.clip), (all.episode, &all.clip));
+        assert!((few.sums.means().mbo - all.sums.means().mbo).abs() < 0.05);
+    }
+}
+
+#[test]
+fn falls_end_episodes_and_are_named() {
+    let robot = emp27();
+    let evaluation = run(&robot, 2, &hard());
+    assert!(evaluation.failures.len() > 10, "{:?}", evaluation.all);
+    let failed = evaluation
+        .results
+        .iter()
+        .filter(|result| result.failure.is_some());
+    for (failure, result) in evaluation.failures.iter().zip(failed) {
+        assert_eq!(
+            (failure.episode, &failure.clip),
+            (result.episode, &result.clip)
+        );
+        assert_eq!(failure.time, result.frames as f64 / 50.0);
+        assert!(
+            failure.reason.contains("base") && result.frames <= 40,
+            "{failure:?}"
+        );
+        assert_eq!(
+            (result.sums.frames, result.sums.sums.suc),
+            (result.frames, 0.0)
+        );
+    }
+    let stood = evaluation
+        .results
+        .iter()
+        .filter(|result| result.failure.is_none());
+    assert!(
+        stood
+            .clone()
+            .all(|result| result.frames == 40 && result.sums.sums.suc == 1.0)
+    );
+    let share = stood.count() as f64 / 70.0;
+    assert!((evaluation.all.metrics.suc.mean - share).abs() < 1e-12);
+    let parts = [&evaluation.recorded, &evaluation.procedural];
+    let parts = parts.map(|part| part.as_ref().unwrap().episodes);
+    assert_eq!(parts, [28, 42]);
+}
+
+#[test]
+fn conditions_make_it_harder() {
+    let robot = emp27();
+    let easy = run(&robot, 2, &EvaluationSettings::default());
+    assert_eq!(easy.all.episodes, 5);
+    assert_eq!(easy.all.metrics.suc.mean, 1.0, "{:?}", easy.failures);
+    let hard = run(&robot, 2, &hard());
+    assert!(
+        hard.all.metrics.suc.mean < 0.9 && hard.all.metrics.mbv.mean < easy.all.metrics.mbv.mean
+    );
+
+    let goals = |settings: &EvaluationSettings| run(&robot, 2, settings).all.goals.unwrap();
+    let plain = goals(&EvaluationSettings::default());
+    let fast = goals(&EvaluationSettings {
+        speed: 1.5,
+        ..Default::default()
+    });
+    let wide = goals(&EvaluationSettings {
+        amplitude: 1.5,
+        ..Default::default()
+    });
+    assert!((fast.joint_speed.mean / plain.joint_speed.mean - 1.5).abs() < 0.1);
+    assert!(
+        fast.frames < plain.frames && (fast.amplitude.mean - plain.amplitude.mean).abs() < 0.02
+    );
+    assert!((wide.amplitude.mean / plain.amplitude.mean - 1.5).abs() < 0.05);
+}
+
+#[test]
+fn tracking_is_judged_by_the_goal_that_was_asked_for() {
+    let robot = emp27();
+    let clips = clips(&robot, 4, 60);
+    let score = |filter: &str| {
+        let controller = controller(&robot, filter);
+        let settings = EvaluationSettings::default();
+        evaluate(&pool(&robot, 2), &controller, &clips, &settings, &mut ()).unwrap()
+    };
+    let (raw, cut) = (score("decoupled"), score("amplitude-cut:factor=0"));
+    assert_eq!(
+        (raw.controller.as_str(), cut.controller.as_str()),
+        ("decoupled", "amplitude-cut:factor=0")
+    );
+    let difference = cut.difference(&raw).unwrap();
+    assert!(difference.mjp.high < 0.0, "{difference:?}");
+    let means = cut.all.metrics.mjp.mean - raw.all.metrics.mjp.mean;
+    assert!((difference.mjp.mean - means).abs() < 1e-12);
+    let other = EvaluationSettings {
+        seed: 1,
+        ..Default::default()
+    };
+    assert_eq!(cut.difference(&run(&robot, 2, &other)), None);
+}
+
+/// Cancels once it was told of some episodes.
+struct Patience {
+    left: Cell<usize>,
+}
+
+impl Progress for Patience {
+    fn finished(&mut self, _: &EpisodeResult) {
+        self.left.set(self.left.get().saturating_sub(1));
+    }
+
+    fn is_cancelled(&self) -> bool {
+        self.left.get() == 0
+    }
+}
+
+#[test]
+fn a_cancelled_evaluation_leaves_what_it_finished() {
+    let robot = emp27();
+    let complete = run(&robot, 2, &hard());
+    let clips = clips(&robot, 5, 40);
+    let controller = controller(&robot, "decoupled");
+    let run = |episodes: usize| {
+        let mut patience = Patience {
+            left: Cell::new(episodes),
+        };
+        evaluate(
+            &pool(&robot, 2),
+            &controller,
+            &clips,
+            &hard(),
+            &mut patience,
+        )
+        .unwrap()
+    };
+    let none = run(0);
+    assert!(none.results.is_empty() && !none.complete);
+    assert_eq!((none.all.episodes, none.recorded), (0, None));
+    let some = run(5);
+    assert!(!some.complete && (5..70).contains(&some.results.len()));
+    for result in &some.results {
+        assert_eq!(result, &complete.results[result.episode]);
+    }
+    assert_eq!(some.all.episodes, some.results.len());
+}
+
+#[test]
+fn json_is_one_object_with_the_metrics_by_name() {
+    let evaluation = run(&emp27(), 2, &hard());
+    let json = serde_json::to_value(&evaluation).unwrap();
+    for name in Metrics::<Interval>::NAMES {
+        for part in ["mean", "low", "high"] {
+            assert!(json[name][part].is_f64(), "{name}: {}", json[name]);
+            assert!(json["procedural"][name][part].is_f64());
+        }
+    }
+    assert_eq!(json["robot"], "emp27");
+    assert_eq!(json["controller"], "decoupled");
+    assert_eq!(
+        (json["episodes"].as_u64(), json["seed"].as_u64()),
+        (Some(70), Some(11))
+    );
+    assert!(json["failures"][0]["reason"].is_string());
+    assert!(json["goals"]["hand_speed"]["p95"].is_f64());
+}
+
+#[test]
+fn what_cannot_be_run_is_refused_by_name() {
+    let robot = emp27();
+    let controller = controller(&robot, "decoupled");
+    let pool = pool(&robot, 1);
+    let good = clips(&robot, 1, 10);
+    let refused = |clips: &[GoalClip], settings: EvaluationSettings| {
+        let result = evaluate(&pool, &controller, clips, &settings, &mut ());
+        result.unwrap_err().to_string()
+    };
+    let usual = EvaluationSettings::default();
+    assert!(refused(&[], usual).contains("clip"));
+    for (settings, name) in [
+        (
+            EvaluationSettings {
+                speed: 0.0,
+                ..usual
+            },
+            "speed",
+        ),
+        (
+            EvaluationSettings {
+                amplitude: f64::NAN,
+                ..usual
+            },
+            "amplitude",
+        ),
+        (
+            EvaluationSettings {
+                hand_load: Some([2.0, 1.0]),
+                ..usual
+            },
+            "hand_mass",
+        ),
+        (
+            EvaluationSettings {
+                push: Some(Kick {
+                    speed: 9.0,
+                    interval: 1.0,
+                }),
+                ..usual
+            },
+            "push.speed",
+        ),
+        (
+            EvaluationSettings {
+                push: Some(Kick {
+                    speed: 1.0,
+                    interval: 0.0,
+                }),
+                ..usual
+            },
+            "push.interval",
+        ),
+    ] {
+        assert!(refused(&good, settings).contains(name), "{name}");
+    }
+}

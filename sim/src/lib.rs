@@ -25,6 +25,7 @@ pub mod environment;
 mod error;
 pub mod evaluation;
 pub mod goals;
+pub mod ladder;
 pub mod metrics;
 mod physics;
 mod pool;

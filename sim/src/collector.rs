@@ -1,5 +1,7 @@
 //! Rollouts: what a learner learns from.
 
+use std::time::{Duration, Instant};
+
 use emp_models::policy::Policy;
 use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
@@ -88,6 +90,7 @@ pub struct Collector {
     environments: VecEnvironment,
     /// One generator of exploration noise an environment.
     noise: Vec<ChaCha8Rng>,
+    inference_time: Duration,
 }
 
 impl Collector {
@@ -101,12 +104,18 @@ impl Collector {
         Self {
             noise: noise.collect(),
             environments,
+            inference_time: Duration::ZERO,
         }
     }
 
     /// The environments.
     pub fn environments(&self) -> &VecEnvironment {
         &self.environments
+    }
+
+    /// Time that the policy took of the last rollout.
+    pub fn inference_time(&self) -> Duration {
+        self.inference_time
     }
 
     /// How hard episodes are that start from now on; see [`VecEnvironment::set_curriculum`].
@@ -142,21 +151,20 @@ impl Collector {
     ) -> Result<Rollout, SimError> {
         self.check(policy, log_std)?;
         let std: Vec<f32> = log_std.iter().map(|log| log.exp()).collect();
-        let mut rollout = Rollout {
-            environments: self.environments.len(),
-            horizon,
-            ..Rollout::default()
-        };
+        let mut rollout = self.empty_rollout(policy, horizon);
         let mut terms = [0.0; REWARD_TERMS];
         let mut features = Vec::new();
+        self.inference_time = Duration::ZERO;
         for t in 0..horizon {
             if stop() {
                 rollout.horizon = t;
                 break;
             }
+            let start = Instant::now();
             let observations = self.environments.observations();
             policy.config().map_history(observations, &mut features);
             let means = policy.actions_from_features(features.clone())?;
+            self.inference_time += start.elapsed();
             let actions = explore(&mut self.noise, &means, &std);
             rollout.features.extend_from_slice(&features);
             rollout
@@ -200,6 +208,24 @@ impl Collector {
         self.environments.restore(&environments)?;
         self.noise = noise;
         Ok(())
+    }
+
+    /// A rollout with room for all that comes.
+    fn empty_rollout(&self, policy: &Policy, horizon: usize) -> Rollout {
+        let environments = self.environments.len();
+        let rows = horizon * environments;
+        let actions = self.environments.layout().last_action().len();
+        Rollout {
+            environments,
+            horizon,
+            features: Vec::with_capacity(rows * policy.config().features()),
+            privileged: Vec::with_capacity(rows * self.environments.privileged_layout().width()),
+            means: Vec::with_capacity(rows * actions),
+            actions: Vec::with_capacity(rows * actions),
+            rewards: Vec::with_capacity(rows),
+            ends: Vec::with_capacity(rows),
+            ..Rollout::default()
+        }
     }
 
     fn check(&self, policy: &Policy, log_std: &[f32]) -> Result<(), SimError> {

@@ -18,13 +18,18 @@ impl CsvLog {
     ///
     /// # Errors
     /// When the file cannot be read or written, or has other columns.
-    pub fn open(path: &Path, columns: &[&str], resume_step: Option<u64>) -> Result<Self> {
+    pub fn open(
+        path: &Path,
+        columns: &[impl AsRef<str>],
+        resume_step: Option<u64>,
+    ) -> Result<Self> {
+        let columns: Vec<&str> = columns.iter().map(AsRef::as_ref).collect();
         let kept = match resume_step {
-            Some(step) if path.exists() => rows_up_to(path, columns, step)?,
+            Some(step) if path.exists() => rows_up_to(path, &columns, step)?,
             _ => Vec::new(),
         };
         let mut text = csv::Writer::from_writer(Vec::new());
-        text.write_record(columns)?;
+        text.write_record(&columns)?;
         for row in &kept {
             text.write_record(row)?;
         }

@@ -12,7 +12,8 @@ use emp_sim::{
 };
 use emp_training::{
     policy::{
-        self,
+        self, Run,
+        judge::Judge,
         settings::{PpoSettings, Symmetry},
         source::LocalSource,
     },
@@ -284,8 +285,16 @@ fn train_policy(arguments: &PolicyArguments) -> Result<ExitCode> {
         "{} exists: continue with --resume, or remove it, or name another --run",
         checkpoint.display()
     );
-    let (library, data) = goal_library(arguments, &robot)?;
+    let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
+    let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
+    let (library, data) = goal_library(arguments, &retargeter)?;
     let pool = Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?);
+    let judge = Judge::new(
+        &retargeter,
+        settings.evaluation_clips,
+        Arc::clone(&pool),
+        arguments.threads,
+    )?;
     let mut source = LocalSource::new(&robot, &pool, &settings, Arc::new(library))?;
     let mut trainer = if arguments.resume {
         policy::Trainer::resume(robot, settings, arguments.threads, &checkpoint, &mut source)?
@@ -293,18 +302,17 @@ fn train_policy(arguments: &PolicyArguments) -> Result<ExitCode> {
         policy::Trainer::new(robot, settings, arguments.threads)?
     };
     let interrupt = Interrupt::listen()?;
-    let outcome = policy::train(
-        &mut trainer,
-        arguments.steps,
-        &mut source,
-        &data,
-        &files,
-        &interrupt,
-    )?;
+    let mut run = Run {
+        source: &mut source,
+        judge: &judge,
+        data,
+        files,
+    };
+    let outcome = policy::train(&mut trainer, arguments.steps, &mut run, &interrupt)?;
     eprintln!("{}", trainer.times());
     match outcome {
         Outcome::Finished => {
-            eprintln!("wrote {}", files.weights.display());
+            eprintln!("wrote {}", arguments.out.display());
             Ok(ExitCode::SUCCESS)
         }
         Outcome::Interrupted => {
@@ -319,12 +327,10 @@ fn train_policy(arguments: &PolicyArguments) -> Result<ExitCode> {
 
 fn goal_library(
     arguments: &PolicyArguments,
-    robot: &Arc<Robot>,
+    retargeter: &Retargeter,
 ) -> Result<(GoalLibrary, serde_json::Value)> {
-    let weights = retargeter_weights(arguments.retargeter.as_ref(), robot);
-    let retargeter = Retargeter::load(&weights, Arc::clone(robot))?;
     let (library, data) = policy::data::library(
-        &retargeter,
+        retargeter,
         &arguments.motions,
         arguments.procedural_clips,
         arguments.seed,

@@ -60,6 +60,16 @@ impl RunFiles {
     pub fn log(&self) -> PathBuf {
         self.folder.join("log.csv")
     }
+
+    /// The log of evaluations during the run.
+    pub fn evaluations(&self) -> PathBuf {
+        self.folder.join("evaluations.csv")
+    }
+
+    /// The best weights so far, as they would be served.
+    pub fn best(&self) -> PathBuf {
+        self.folder.join("best.safetensors")
+    }
 }
 
 /// How a run ended.

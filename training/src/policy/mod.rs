@@ -2,6 +2,7 @@
 
 pub mod curriculum;
 pub mod data;
+pub mod judge;
 pub mod learner;
 pub mod moments;
 pub mod network;
@@ -13,4 +14,4 @@ pub mod symmetry;
 pub mod trainer;
 
 pub use settings::Settings;
-pub use trainer::{Trainer, train};
+pub use trainer::{Run, Trainer, train};

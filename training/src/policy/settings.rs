@@ -19,6 +19,8 @@ pub struct Settings {
     pub warm_up: usize,
     /// Environment steps between two deterministic evaluations.
     pub evaluate_every: u64,
+    /// Procedural clips of such an evaluation.
+    pub evaluation_clips: usize,
     /// Procedural clips in the goal library.
     pub procedural_clips: usize,
     /// The learner.
@@ -37,6 +39,7 @@ impl Default for Settings {
             horizon: 32,
             warm_up: 3,
             evaluate_every: 500_000,
+            evaluation_clips: 128,
             procedural_clips: 1000,
             ppo: PpoSettings::default(),
             curriculum: CurriculumSettings::default(),

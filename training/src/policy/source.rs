@@ -92,7 +92,7 @@ impl RolloutSource for LocalSource {
             .collect(&snapshot.policy, &snapshot.log_std, horizon)?;
         Ok(Collected {
             rollout,
-            inference: Duration::ZERO,
+            inference: self.collector.inference_time(),
         })
     }
 

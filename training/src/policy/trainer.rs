@@ -6,7 +6,7 @@ use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
 use emp_models::{
     CheckpointMetadata,
-    checkpoint::{self, Tensors},
+    checkpoint::{self, Tensors, write_atomically},
     policy::{self, NETWORK_PREFIX, Policy, PolicyConfig},
 };
 use emp_robot::Robot;
@@ -18,6 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     curriculum::{Curriculum, Episode},
+    judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics},
     network::Widths,
     settings::{Settings, Symmetry},
@@ -64,6 +65,8 @@ pub struct Trainer {
     curriculum: Curriculum,
     /// Environment steps learnt from.
     steps: u64,
+    /// The best score of a judged policy.
+    best_score: Option<f64>,
     times: Times,
 }
 
@@ -111,6 +114,7 @@ struct Saved {
     steps: u64,
     learner: learner::Progress,
     curriculum: Curriculum,
+    best_score: Option<f64>,
 }
 
 impl Trainer {
@@ -134,6 +138,7 @@ impl Trainer {
             learner: Learner::new(widths, ppo, mirror, settings.seed, threads)?,
             curriculum: Curriculum::new(settings.curriculum),
             steps: 0,
+            best_score: None,
             times: Times::default(),
             config,
             robot,
@@ -173,6 +178,7 @@ impl Trainer {
             .with_context(|| path.display().to_string())?;
         trainer.curriculum = saved.curriculum;
         trainer.steps = saved.steps;
+        trainer.best_score = saved.best_score;
         Ok(trainer)
     }
 
@@ -210,12 +216,18 @@ impl Trainer {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn export(&self, path: &Path, data: &serde_json::Value) -> Result<CheckpointMetadata> {
+    pub fn export(
+        &self,
+        path: &Path,
+        data: &serde_json::Value,
+        verdict: &Verdict,
+    ) -> Result<CheckpointMetadata> {
         let training = serde_json::json!({
             "command": "emp-train policy",
             "settings": self.settings,
             "steps": self.steps,
             "data": data,
+            "figures": verdict,
         });
         Ok(Policy::save(
             path,
@@ -247,9 +259,20 @@ impl Trainer {
             steps: self.steps,
             learner: self.learner.progress(),
             curriculum: self.curriculum.clone(),
+            best_score: self.best_score,
         })?;
         checkpoint::save(path, metadata, &tensors)?;
         Ok(())
+    }
+
+    /// Judges the policy, and keeps its weights if it is the best so far.
+    fn judge(&mut self, run: &Run<'_>) -> Result<Verdict> {
+        let verdict = run.judge.judge(self.policy()?)?;
+        if self.best_score.is_none_or(|best| verdict.score > best) {
+            self.best_score = Some(verdict.score);
+            self.export(&run.files.best(), &run.data, &verdict)?;
+        }
+        Ok(verdict)
     }
 
     fn snapshot(&self) -> Result<PolicySnapshot> {
@@ -360,7 +383,7 @@ struct Step {
 }
 
 /// The names of the log's columns.
-pub fn columns() -> Vec<&'static str> {
+fn columns() -> Vec<&'static str> {
     let mut columns = vec!["step"];
     columns.extend(EPISODE_COLUMNS);
     columns.push("reward");
@@ -374,6 +397,18 @@ fn run_metadata(robot: &Robot) -> CheckpointMetadata {
     CheckpointMetadata::for_joints(RUN_KIND, robot, robot.joints())
 }
 
+/// What a run reads and writes beside the trainer's state.
+pub struct Run<'a> {
+    /// The environments.
+    pub source: &'a mut dyn RolloutSource,
+    /// Judges the policy now and then; the best one's weights are the run's result.
+    pub judge: &'a Judge,
+    /// What the goals were made of, for the weights' metadata.
+    pub data: serde_json::Value,
+    /// The run's files.
+    pub files: RunFiles,
+}
+
 /// Runs the trainer until it has learnt from `steps` environment steps or is interrupted, saving now and then.
 ///
 /// # Errors
@@ -381,35 +416,44 @@ fn run_metadata(robot: &Robot) -> CheckpointMetadata {
 pub fn train(
     trainer: &mut Trainer,
     steps: u64,
-    source: &mut dyn RolloutSource,
-    data: &serde_json::Value,
-    files: &RunFiles,
+    run: &mut Run<'_>,
     interrupt: &Interrupt,
 ) -> Result<Outcome> {
     let done = trainer.steps();
-    let mut log = CsvLog::open(&files.log(), &columns(), (done > 0).then_some(done))?;
+    let resumed = (done > 0).then_some(done);
+    let mut log = CsvLog::open(&run.files.log(), &columns(), resumed)?;
+    let mut verdicts = CsvLog::open(&run.files.evaluations(), &Verdict::columns(), resumed)?;
     if done == 0 {
-        trainer.warm_up(source)?;
+        trainer.warm_up(run.source)?;
     }
     let bar = run::progress(steps, done);
     let mut saved = Instant::now();
     while trainer.steps() < steps {
         if interrupt.requested() {
-            trainer.save_run(&files.checkpoint(), source)?;
+            trainer.save_run(&run.files.checkpoint(), run.source)?;
             bar.abandon_with_message("interrupted; continue with --resume");
             return Ok(Outcome::Interrupted);
         }
-        let step = trainer.step(source)?;
+        let before = trainer.steps();
+        let step = trainer.step(run.source)?;
         log.row(trainer.steps(), &trainer.row(&step))?;
         bar.set_position(trainer.steps());
         bar.set_message(trainer.message(&step));
-        if saved.elapsed() >= files.save_every {
-            trainer.save_run(&files.checkpoint(), source)?;
+        let every = trainer.settings.evaluate_every;
+        if before / every < trainer.steps() / every || trainer.steps() >= steps {
+            let verdict = trainer.judge(run)?;
+            verdicts.row(trainer.steps(), &verdict.row())?;
+        }
+        if saved.elapsed() >= run.files.save_every {
+            trainer.save_run(&run.files.checkpoint(), run.source)?;
             saved = Instant::now();
         }
     }
-    trainer.save_run(&files.checkpoint(), source)?;
-    trainer.export(&files.weights, data)?;
+    trainer.save_run(&run.files.checkpoint(), run.source)?;
+    let best = run.files.best();
+    let weights = std::fs::read(&best).with_context(|| format!("reading {}", best.display()))?;
+    write_atomically(&run.files.weights, &weights)
+        .with_context(|| format!("writing {}", run.files.weights.display()))?;
     bar.finish();
     Ok(Outcome::Finished)
 }

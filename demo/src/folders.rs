@@ -16,8 +16,8 @@ pub(crate) struct Folders {
 
 impl Folders {
     /// Takes the nearest folder upward from this binary, then from the working directory, that has `robots` and
-    /// `models/weights`: the rule of `emp-server`.
-    pub(crate) fn find() -> Result<Self> {
+    /// `models/weights`: the rule of `emp-server`. The weights may stand elsewhere.
+    pub(crate) fn find(weights: Option<&Path>) -> Result<Self> {
         let exe = std::env::current_exe().context("cannot tell where emp-demo itself stands")?;
         let here = std::env::current_dir().context("there is no working directory")?;
         let root = exe
@@ -28,7 +28,7 @@ impl Folders {
         let server = exe.with_file_name(format!("emp-server{}", std::env::consts::EXE_SUFFIX));
         Ok(Self {
             robots: root.join("robots"),
-            weights: root.join("models/weights"),
+            weights: weights.map_or_else(|| root.join("models/weights"), Path::to_owned),
             server,
         })
     }

@@ -1,20 +1,25 @@
 //! `emp-demo`: a simulated robot at the other end of the wire.
 //!
-//! Starts the `emp-server` that stands beside it, streams a person's motion through it over TCP with the client
-//! library, replays the joint targets that come back on the robot in MuJoCo (pelvis held), and leaves numbers and a
-//! picture. It computes no joint angle itself, and everything that it reports is measured on what came over the wire.
+//! Starts the `emp-server` that stands beside it and closes the loop through it over TCP with the client library, fifty times
+//! a second by the clock: a person's pose becomes a goal, the goal and the robot's state become joint targets, and a
+//! robot in MuJoCo follows them on its own feet. Leaves numbers and pictures. It computes no joint angle itself:
+//! everything that it reports is measured on what came over the wire and out of MuJoCo.
 
 #![forbid(unsafe_code)]
 
+mod conditions;
+mod control;
 mod folders;
 mod measure;
 mod motion;
 mod output;
 mod picture;
+mod posture;
 mod server;
-mod stream;
+mod simulator;
+mod stance;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -23,15 +28,18 @@ use clap::Parser;
 use emp_robot::Robot;
 use tokio::signal::unix::{SignalKind, signal};
 
+use crate::conditions::Conditions;
+use crate::control::Run;
 use crate::folders::Folders;
 use crate::measure::Summary;
 use crate::motion::Motion;
+use crate::posture::postures;
 use crate::server::Server;
-use crate::stream::Answers;
 
-/// Streams a person's motion through a real server and shows what a simulated robot makes of it.
+/// A simulated robot follows a person's motion on its own feet, in real time, controlled by a real server.
 ///
-/// Leaves joints.csv (the joint targets), summary.json and contact-sheet.png in the output folder.
+/// Leaves joints.csv (goals, executed targets and measured angles), summary.json, contact-sheet.png and stance-sheet.png in
+/// the output folder. A robot that falls is a result, not an error: the motion ends there, and the exit code is 0.
 #[derive(Parser)]
 #[command(version)]
 struct Options {
@@ -44,6 +52,18 @@ struct Options {
     /// Where the files go; made if it is not there
     #[arg(long, value_name = "DIR", default_value = "out/demo")]
     out: PathBuf,
+    /// The weights that the server answers with [default: models/weights of the project]
+    #[arg(long, value_name = "DIR")]
+    weights: Option<PathBuf>,
+    /// Seed of what is random: hand loads, directions of pushes
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Mass in each hand, kg [default: drawn from the robot's range for tests]
+    #[arg(long, value_name = "KG", value_parser = not_negative)]
+    load: Option<f64>,
+    /// Push the robot's base every 5 s: what is added to its speed, m/s
+    #[arg(long, value_name = "M/S", default_value_t = 0.0, value_parser = not_negative)]
+    push: f64,
     /// Print summary.json alone on standard output
     #[arg(long)]
     json: bool,
@@ -61,14 +81,16 @@ fn main() -> ExitCode {
 }
 
 fn run(options: &Options) -> Result<()> {
-    let folders = Folders::find()?;
+    let folders = Folders::find(options.weights.as_deref())?;
     let robot = Robot::load(&folders.robot(&options.robot)?)?;
     let motion = Motion::load(options.motion.as_deref(), robot.control_rate_hz())?;
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot make {}", options.out.display()))?;
 
     let demo = Arc::new(Demo {
-        robot,
+        conditions: Conditions::new(&robot, options.seed, options.load, options.push),
+        seed: options.seed,
+        robot: Arc::new(robot),
         motion,
         out: options.out.clone(),
     });
@@ -90,10 +112,20 @@ fn run(options: &Options) -> Result<()> {
     Ok(())
 }
 
+/// A number of at least 0.
+fn not_negative(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value.is_finite() && value >= 0.0 => Ok(value),
+        _ => Err("expected a number of at least 0".to_owned()),
+    }
+}
+
 /// What is played, and where the result goes.
 struct Demo {
-    robot: Robot,
+    robot: Arc<Robot>,
     motion: Motion,
+    seed: u64,
+    conditions: Conditions,
     out: PathBuf,
 }
 
@@ -104,7 +136,7 @@ impl Demo {
         let mut terminated = signal(SignalKind::terminate()).context("SIGTERM")?;
         let mut server = Server::spawn(folders)?;
         let result = tokio::select! {
-            result = self.clone().stream_and_show(&mut server) => result,
+            result = self.clone().follow_and_show(&mut server) => result,
             _ = interrupted.recv() => bail_interrupted(),
             _ = terminated.recv() => bail_interrupted(),
         };
@@ -114,29 +146,29 @@ impl Demo {
         Ok(summary)
     }
 
-    async fn stream_and_show(self: Arc<Self>, server: &mut Server) -> Result<Summary> {
+    async fn follow_and_show(self: Arc<Self>, server: &mut Server) -> Result<Summary> {
         let url = server.url().await?;
-        let frames = self.motion.clip.frames.len();
         eprintln!(
-            "emp-server at {url}: streaming {frames} frames of {}",
-            self.motion.name
+            "emp-server at {url}: {} follows {} for {:.1} s",
+            self.robot.name(),
+            self.motion.name,
+            self.motion.time(self.motion.clip.frames.len())
         );
-        let answers = stream::play(&url, &self.robot, &self.motion.clip).await?;
-        eprintln!(
-            "replaying the joint targets on {} in MuJoCo",
-            self.robot.name()
-        );
-        tokio::task::spawn_blocking(move || self.show(&answers))
+        let conditions = self.conditions.clone();
+        let run = control::run(&url, &self.robot, &self.motion.clip, conditions).await?;
+        tokio::task::spawn_blocking(move || self.show(&run))
             .await
-            .context("the replay stopped")?
+            .context("the drawing stopped")?
     }
 
-    /// Replays the answers, measures, draws, and writes everything down.
-    fn show(&self, answers: &Answers) -> Result<Summary> {
-        let replay = emp_sim::replay(&self.robot, &answers.targets)?;
-        let (summary, errors) = measure::summary(&self.robot, &self.motion, answers, &replay)?;
-        let sheet = output::contact_sheet(&self.robot, &self.motion, &replay, &errors, &summary)?;
-        output::write(Path::new(&self.out), &self.robot, answers, &summary, &sheet)?;
+    /// Measures, draws, and writes everything down.
+    fn show(&self, run: &Run) -> Result<Summary> {
+        let (robot, motion) = (&*self.robot, &self.motion);
+        let postures = postures(robot, run)?;
+        let conditions = (self.seed, &self.conditions);
+        let (summary, errors) = measure::summary(robot, motion, conditions, run, &postures)?;
+        let sheets = output::sheets(robot, motion, run, &postures, &errors, &summary)?;
+        output::write(&self.out, robot, run, &summary, &sheets)?;
         Ok(summary)
     }
 }

@@ -1,23 +1,28 @@
 //! What the robot made of the motion, in numbers.
 
 use std::fmt;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use emp_client::{BatchStatistics, Percentiles};
 use emp_motion::{KeyNodeFrame, Side};
 use emp_robot::Robot;
-use emp_sim::{Replay, SelfCollision};
+use emp_sim::SelfCollision;
+use emp_sim::metrics::{EpisodeSums, Frame, Metrics};
 use nalgebra::Vector3;
 use serde::Serialize;
 
+use crate::conditions::Conditions;
+use crate::control::{Run, StreamReport};
 use crate::motion::Motion;
-use crate::output::robot_pose;
-use crate::stream::Answers;
+use crate::posture::{Posture, robot_pose};
 
 /// A joint that moves farther than this from one frame to the next jumps, radians.
 const JUMP: f32 = 0.25;
 /// Arm bones of a frame: upper arm and forearm of both sides.
 const BONES: usize = 4;
+/// Share of its torque limit from which a motor counts as saturated.
+const SATURATED: f32 = 0.999;
 
 /// The content of `summary.json`.
 #[derive(Debug, Serialize)]
@@ -26,16 +31,70 @@ pub(crate) struct Summary {
     robot: String,
     /// The motion's name.
     motion: String,
+    /// Length of the motion, seconds.
+    seconds: f64,
+    /// Frames that the robot went through: all, or those up to its fall.
+    frames: usize,
+    /// Seed of the conditions.
+    seed: u64,
+    /// Mass added to the left and the right hand, kg.
+    hand_load_kg: [f64; 2],
+    /// What each push added to the base's speed, m/s.
+    push_m_per_s: f64,
+    /// Pushes.
+    pushes: usize,
+    /// Whether the robot stood to the motion's end.
+    stood: bool,
+    /// When and why it fell, if it did.
+    fall: Option<Fall>,
+    /// Largest angle between the base's axis and the vertical, degrees.
+    largest_tilt_deg: f32,
+    /// The paper's metrics of this one episode.
+    metrics: Metrics<f64>,
+    /// Simulated seconds a second.
+    real_time_factor: f64,
+    /// From the robot's state to its new targets, over both streams, milliseconds; an unanswered period counts as long as
+    /// the robot waited.
+    round_trip_ms: Percentiles,
+    /// Control periods without an answer in time, in which the robot kept the targets that it had.
+    missed_periods: usize,
+    /// The stream of poses.
+    retargeting: Stream,
+    /// The stream of robot states.
+    policy: Stream,
+    /// Between the person's arm bones and those of a robot that stands in the answered goals, degrees.
+    direction_error_deg: Spread,
+    /// Between the person's arm bones and those of the robot in MuJoCo at the same moment, each seen from its pelvis,
+    /// degrees.
+    direction_error_in_physics_deg: Spread,
+    /// Frames in which a joint of the goal jumps: moves more than 0.25 rad from the frame before.
+    jumps: usize,
+    /// Largest move of a joint of the goal from one frame to the next, radians.
+    largest_jump_rad: f32,
+    /// Share of answers with a joint at a limit, 0 to 1.
+    limit_share: f64,
+    /// Share of frames whose goals touch the robot itself, 0 to 1.
+    self_collision_share: f64,
+    /// Share of motors and frames at the torque limit, 0 to 1.
+    saturated_share: f64,
+}
+
+/// When and why the robot fell.
+#[derive(Debug, Serialize)]
+pub(crate) struct Fall {
+    /// Since the motion began, seconds.
+    pub(crate) time: f64,
+    /// In words.
+    reason: String,
+}
+
+/// One stream to the server.
+#[derive(Debug, Serialize)]
+struct Stream {
     /// The model that answered.
     model: String,
     /// Its version.
-    model_version: String,
-    /// Frames sent, all of them answered.
-    frames: usize,
-    /// Length of the motion, seconds.
-    seconds: f64,
-    /// Frames answered a second, each sent when the one before it was answered.
-    fps: f64,
+    version: String,
     /// From sending a frame to its answer, milliseconds.
     latency_ms: Percentiles,
     /// Waiting for the model, milliseconds.
@@ -44,22 +103,6 @@ pub(crate) struct Summary {
     inference_ms: Percentiles,
     /// Frames a batch.
     batch: BatchStatistics,
-    /// Between the person's arm bones and those of a robot that stands in the answered targets, degrees.
-    direction_error_deg: Spread,
-    /// Between the person's arm bones and those of the robot in MuJoCo at the same moment, degrees.
-    direction_error_in_physics_deg: Spread,
-    /// Frames in which a joint target jumps: moves more than 0.25 rad from the frame before.
-    jumps: usize,
-    /// Largest move of a joint target from one frame to the next, radians.
-    largest_jump_rad: f32,
-    /// Share of frames with a joint at a limit, 0 to 1.
-    limit_share: f64,
-    /// Share of frames whose targets touch the robot itself, 0 to 1.
-    self_collision_share: f64,
-    /// Share of frames in which the robot touched itself in MuJoCo, 0 to 1.
-    self_collision_in_physics_share: f64,
-    /// Share of goal actuators and physics steps at the torque limit, 0 to 1.
-    saturated_share: f64,
 }
 
 /// A mean and a 95th percentile.
@@ -73,45 +116,53 @@ struct Spread {
 pub(crate) fn summary(
     robot: &Robot,
     motion: &Motion,
-    answers: &Answers,
-    replay: &Replay,
+    (seed, conditions): (u64, &Conditions),
+    run: &Run,
+    postures: &[Posture],
 ) -> Result<(Summary, Vec<f32>)> {
-    let frames = &motion.clip.frames;
-    let asked = direction_errors(frames, &target_poses(robot, &answers.targets));
-    let reached: Vec<KeyNodeFrame> = replay
-        .frames
+    let human = &motion.clip.frames;
+    let goals: Vec<&Vec<f32>> = run.periods.iter().map(|period| &period.goal).collect();
+    let asked = direction_errors(human, &goal_poses(robot, &goals));
+    let reached: Vec<KeyNodeFrame> = postures
         .iter()
-        .map(|frame| robot_pose(&frame.key_nodes, &frame.wrist_rotations))
+        .map(|posture| posture.pose.clone())
         .collect();
-    let reached = direction_errors(frames, &reached);
-    let moves: Vec<f32> = answers
-        .targets
+    let reached = direction_errors(human, &reached);
+    let moves: Vec<f32> = goals
         .windows(2)
-        .map(|pair| largest_move(&pair[0], &pair[1]))
+        .map(|pair| largest_move(pair[0], pair[1]))
         .collect();
-    let statistics = &answers.statistics;
+    let seconds = run.periods.len() as f64 / robot.control_rate_hz();
+    let tilts = postures.iter().map(|posture| posture.stance.tilt());
+    let retargeted = &run.retargeting.statistics.retargeting;
     let summary = Summary {
         robot: robot.name().to_owned(),
         motion: motion.name.clone(),
-        model: answers.model.0.clone(),
-        model_version: answers.model.1.clone(),
-        frames: frames.len(),
-        seconds: motion.time(frames.len()),
-        fps: statistics.fps,
-        latency_ms: statistics.latency_ms,
-        queue_ms: statistics.queue_ms,
-        inference_ms: statistics.inference_ms,
-        batch: statistics.batch,
+        seconds: motion.time(human.len()),
+        frames: run.periods.len(),
+        seed,
+        hand_load_kg: conditions.hand_load,
+        push_m_per_s: conditions.push_speed,
+        pushes: run.periods.iter().filter(|period| period.pushed).count(),
+        stood: run.fall.is_none(),
+        fall: run.fall.map(|reason| Fall {
+            time: seconds,
+            reason: reason.to_string(),
+        }),
+        largest_tilt_deg: tilts.fold(0.0, f32::max).to_degrees(),
+        metrics: metrics(robot, run),
+        real_time_factor: seconds / run.wall_time.as_secs_f64(),
+        round_trip_ms: percentiles(run.periods.iter().map(|period| period.round_trip)),
+        missed_periods: run.periods.iter().filter(|period| !period.answered).count(),
+        retargeting: Stream::new(&run.retargeting),
+        policy: Stream::new(&run.policy),
         direction_error_deg: Spread::of(asked.as_flattened()),
         direction_error_in_physics_deg: Spread::of(reached.as_flattened()),
         jumps: moves.iter().filter(|&&step| step > JUMP).count(),
         largest_jump_rad: moves.iter().copied().fold(0.0, f32::max),
-        limit_share: statistics
-                .retargeting
-                .map_or(0.0, |retargeting| retargeting.limit_share),
-        self_collision_share: SelfCollision::new(robot)?.share(&answers.targets)?,
-        self_collision_in_physics_share: replay.self_collision_share(),
-        saturated_share: replay.saturated_share,
+        limit_share: retargeted.map_or(0.0, |retargeted| retargeted.limit_share),
+        self_collision_share: SelfCollision::new(robot)?.share(&goals)?,
+        saturated_share: saturated_share(robot, run),
     };
     let by_frame = reached
         .iter()
@@ -120,19 +171,69 @@ pub(crate) fn summary(
     Ok((summary, by_frame))
 }
 
-/// The robot's key nodes with its goal joints at each row of targets.
-fn target_poses(robot: &Robot, targets: &[Vec<f32>]) -> Vec<KeyNodeFrame> {
+/// The paper's metrics, as the evaluation computes them.
+fn metrics(robot: &Robot, run: &Run) -> Metrics<f64> {
+    let mut sums = EpisodeSums::default();
+    let goals = robot.goal_joints().len();
+    let readings = run.periods.iter().map(|period| &period.reading);
+    let before = std::iter::once(&run.start).chain(readings);
+    for (period, before) in run.periods.iter().zip(before) {
+        if period.reading.divergence.is_none() {
+            sums.add(&Frame {
+                reading: &period.reading,
+                goal: &period.goal,
+                speeds_before: &before.joint_velocities[..goals],
+            });
+        }
+    }
+    sums.sums.suc = f64::from(u8::from(run.fall.is_none()));
+    sums.means()
+}
+
+/// Share of motors and frames at the torque limit.
+fn saturated_share(robot: &Robot, run: &Run) -> f64 {
+    let saturated = |torques: &[f32]| {
+        let motors = torques.iter().zip(robot.joints());
+        motors
+            .filter(|(torque, joint)| torque.abs() >= SATURATED * joint.torque_limit as f32)
+            .count()
+    };
+    let torques = run.periods.iter().map(|period| &period.reading.torques);
+    let all = run.periods.len() * robot.joints().count();
+    torques.map(|torques| saturated(torques)).sum::<usize>() as f64 / all.max(1) as f64
+}
+
+fn percentiles(times: impl Iterator<Item = Duration>) -> Percentiles {
+    let mut sorted: Vec<f64> = times.map(|time| 1e3 * time.as_secs_f64()).collect();
+    sorted.sort_by(f64::total_cmp);
+    Percentiles {
+        p50: percentile(&sorted, 0.5),
+        p90: percentile(&sorted, 0.9),
+        p99: percentile(&sorted, 0.99),
+        max: percentile(&sorted, 1.0),
+    }
+}
+
+/// The smallest of sorted values that a share of them does not exceed; 0 of none.
+fn percentile<T: Copy + Default>(sorted: &[T], share: f64) -> T {
+    let rank = (share * sorted.len() as f64).ceil() as usize;
+    let value = sorted.get(rank.saturating_sub(1));
+    value.copied().unwrap_or_default()
+}
+
+/// The robot's key nodes with its goal joints at each of the goals.
+fn goal_poses(robot: &Robot, goals: &[&Vec<f32>]) -> Vec<KeyNodeFrame> {
     let mut kinematics = robot.kinematics().frame();
-    let pose = |target: &Vec<f32>| {
+    let pose = |goal: &&Vec<f32>| {
         kinematics.update(
-            &target
+            &goal
                 .iter()
                 .map(|&angle| f64::from(angle))
                 .collect::<Vec<_>>(),
         );
         robot_pose(kinematics.positions(), kinematics.wrist_rotations())
     };
-    targets.iter().map(pose).collect()
+    goals.iter().map(pose).collect()
 }
 
 /// Angles between the person's and the robot's arm bones, degrees, frame by frame.
@@ -167,10 +268,24 @@ impl Spread {
     fn of(values: &[f32]) -> Self {
         let mut sorted = values.to_vec();
         sorted.sort_by(f32::total_cmp);
-        let rank = (0.95 * sorted.len() as f64).ceil() as usize;
         Self {
             mean: sorted.iter().sum::<f32>() / sorted.len().max(1) as f32,
-            p95: sorted.get(rank.saturating_sub(1)).copied().unwrap_or(0.0),
+            p95: percentile(&sorted, 0.95),
+        }
+    }
+}
+
+impl Stream {
+    fn new(report: &StreamReport) -> Self {
+        let (model, version) = report.model.clone();
+        let statistics = &report.statistics;
+        Self {
+            model,
+            version,
+            latency_ms: statistics.latency_ms,
+            queue_ms: statistics.queue_ms,
+            inference_ms: statistics.inference_ms,
+            batch: statistics.batch,
         }
     }
 }
@@ -183,46 +298,117 @@ impl Summary {
         Ok(text + "\n")
     }
 
-    /// Title and subtitle of the contact sheet.
-    pub(crate) fn titles(&self) -> [String; 2] {
-        let Spread { mean, p95 } = self.direction_error_in_physics_deg;
-        [
-            format!("{} follows {}", self.robot, self.motion),
-            format!(
-                "above the person, below the robot in MuJoCo; arm directions {mean:.1}° apart on average, {p95:.1}° at p95"
+    /// When and why the robot fell, if it did.
+    pub(crate) fn fall(&self) -> Option<&Fall> {
+        self.fall.as_ref()
+    }
+
+    /// What happened, in a line.
+    pub(crate) fn title(&self) -> String {
+        let Self {
+            robot,
+            motion,
+            seconds,
+            ..
+        } = self;
+        match &self.fall {
+            None => format!("{robot} follows {motion} on its own feet"),
+            Some(fall) => format!(
+                "{robot} follows {motion} and falls after {:.1} of {seconds:.1} s",
+                fall.time
             ),
-        ]
+        }
+    }
+
+    /// Second line of the contact sheet.
+    pub(crate) fn contact_subtitle(&self) -> String {
+        let Spread { mean, p95 } = self.direction_error_in_physics_deg;
+        format!(
+            "above the person, below the robot in MuJoCo; arm directions {mean:.1}° apart on average, {p95:.1}° at p95"
+        )
+    }
+
+    /// Second line of the stance sheet.
+    pub(crate) fn stance_subtitle(&self) -> String {
+        let [left, right] = self.hand_load_kg;
+        let tilt = self.largest_tilt_deg;
+        let mut text = format!(
+            "base tilted by {tilt:.1}° at most; {left:.2} kg in the left hand, {right:.2} kg in the right"
+        );
+        match self.pushes {
+            0 => {}
+            1 => text += &format!(", pushed once by {} m/s", self.push_m_per_s),
+            pushes => text += &format!(", pushed {pushes} times by {} m/s", self.push_m_per_s),
+        }
+        text
     }
 }
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}", self.title())?;
+        match &self.fall {
+            None => writeln!(
+                f,
+                "  balance         stood for {:.1} s, base tilted by {:.1}° at most",
+                self.seconds, self.largest_tilt_deg
+            )?,
+            Some(Fall { time, reason }) => {
+                writeln!(f, "  balance         FELL after {time:.2} s: {reason}")?;
+            }
+        }
+        let [left, right] = self.hand_load_kg;
+        writeln!(
+            f,
+            "  conditions      {left:.2} and {right:.2} kg in the hands, {} pushes of {} m/s; seed {}",
+            self.pushes, self.push_m_per_s, self.seed
+        )?;
+        let trip = &self.round_trip_ms;
+        writeln!(
+            f,
+            "  control loop    {:.3} × real time; round trip {:.2} ms (p50), {:.2} ms (p99); {} of {} periods missed",
+            self.real_time_factor, trip.p50, trip.p99, self.missed_periods, self.frames
+        )?;
+        self.write_metrics(f)?;
+        self.write_retargeting(f)
+    }
+}
+
+impl Summary {
+    fn write_metrics(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Metrics {
+            suc,
+            mjp,
+            msc,
+            mbv,
+            mba,
+            mbo,
+            mus,
+            self_collision_share,
+        } = &self.metrics;
+        writeln!(
+            f,
+            "  metrics         SUC {suc:.0}, MJP {mjp:.3}, MSC {msc:.2} N, MBV {mbv:.3}, MBA {mba:.3}, MBO {mbo:.3}, MUS {mus:.3} (rad/s)²"
+        )?;
+        writeln!(
+            f,
+            "  robot           touches itself in {} of frames, {} as answered; {} of torques at their limit",
+            percent(*self_collision_share),
+            percent(self.self_collision_share),
+            percent(self.saturated_share)
+        )
+    }
+
+    fn write_retargeting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
-            latency_ms,
-            batch,
             direction_error_deg: asked,
             direction_error_in_physics_deg: reached,
             ..
         } = self;
         writeln!(
             f,
-            "{} follows {}: {} frames, {:.1} s",
-            self.robot, self.motion, self.frames, self.seconds
-        )?;
-        writeln!(
-            f,
-            "  over the wire   {:.0} frames/s one by one; latency {:.2} ms (p50), {:.2} ms (p99); {:.1} frames a batch",
-            self.fps, latency_ms.p50, latency_ms.p99, batch.mean
-        )?;
-        writeln!(
-            f,
-            "  arm directions  {:.1}° off (p95 {:.1}°) as answered",
-            asked.mean, asked.p95
-        )?;
-        writeln!(
-            f,
-            "                  {:.1}° off (p95 {:.1}°) as moved in MuJoCo",
-            reached.mean, reached.p95
+            "  arm directions  {:.1}° off (p95 {:.1}°) as answered, {:.1}° (p95 {:.1}°) as moved in MuJoCo",
+            asked.mean, asked.p95, reached.mean, reached.p95
         )?;
         writeln!(
             f,
@@ -230,13 +416,6 @@ impl fmt::Display for Summary {
             self.jumps,
             self.largest_jump_rad,
             percent(self.limit_share)
-        )?;
-        writeln!(
-            f,
-            "  robot           touches itself in {} of frames as answered, {} in MuJoCo; {} of torques at their limit",
-            percent(self.self_collision_share),
-            percent(self.self_collision_in_physics_share),
-            percent(self.saturated_share)
         )
     }
 }

@@ -7,94 +7,131 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use emp_motion::joint_csv::JointCsvWriter;
-use emp_motion::{KEY_NODES, KeyNodeFrame};
 use emp_robot::Robot;
-use emp_sim::Replay;
-use nalgebra::{Matrix3, Rotation3, Vector3};
 
+use crate::control::Run;
 use crate::measure::Summary;
 use crate::motion::Motion;
-use crate::picture::{Moment, Sheet, differing};
-use crate::stream::Answers;
+use crate::picture::{Moment, Sheet, StanceSheet, differing};
+use crate::posture::Posture;
 
 /// The files, in the order in which they are written.
-pub(crate) const FILES: [&str; 3] = ["joints.csv", "summary.json", "contact-sheet.png"];
+pub(crate) const FILES: [&str; 4] = [
+    "joints.csv",
+    "summary.json",
+    "contact-sheet.png",
+    "stance-sheet.png",
+];
 
-/// How many moments the contact sheet shows.
+/// How many moments the sheets show.
 const MOMENTS: usize = 8;
 
-/// A robot's key nodes as a pose; `positions` in its pelvis frame, metres.
-pub(crate) fn robot_pose(
-    positions: &[Vector3<f64>; KEY_NODES],
-    wrists: &[Matrix3<f64>; 2],
-) -> KeyNodeFrame {
-    KeyNodeFrame {
-        positions: positions.map(Vector3::cast),
-        wrist_rotations: wrists.map(|wrist| Some(Rotation3::from_matrix_unchecked(wrist.cast()))),
-    }
-}
-
-/// The contact sheet as a PNG file; `errors` are the frames' direction errors in degrees.
-pub(crate) fn contact_sheet(
+/// The contact sheet and the stance sheet as PNG files; `errors` are the frames' direction errors in degrees.
+pub(crate) fn sheets(
     robot: &Robot,
     motion: &Motion,
-    replay: &Replay,
+    run: &Run,
+    postures: &[Posture],
     errors: &[f32],
     summary: &Summary,
-) -> Result<Vec<u8>> {
+) -> Result<[Vec<u8>; 2]> {
+    let executed = &motion.clip.frames[..run.periods.len()];
+    let fixed: Vec<usize> = most_tilted(postures)
+        .into_iter()
+        .chain(last_of_fall(run))
+        .collect();
     let moment = |index: usize| {
-        let frame = &replay.frames[index];
+        let posture = &postures[index];
         let time = motion.time(index);
         Moment {
             time,
             name: motion.part(time).to_owned(),
             direction_error_deg: errors[index],
-            human: motion.clip.frames[index].clone(),
-            robot: robot_pose(&frame.key_nodes, &frame.wrist_rotations),
-            legs: frame
-                .legs
-                .clone()
-                .map(|leg| leg.into_iter().map(Vector3::cast).collect()),
+            human: executed[index].clone(),
+            robot: posture.pose.clone(),
+            legs: posture.legs.clone(),
+            stance: posture.stance.clone(),
         }
     };
-    let moments: Vec<Moment> = differing(&motion.clip.frames, MOMENTS)
+    let moments: Vec<Moment> = differing(executed, &fixed, MOMENTS)
         .into_iter()
         .map(moment)
         .collect();
-    let [title, subtitle] = summary.titles();
-    let sheet = Sheet {
+    let stances: Vec<_> = postures
+        .iter()
+        .map(|posture| posture.stance.clone())
+        .collect();
+    let pushed = run
+        .periods
+        .iter()
+        .enumerate()
+        .filter(|(_, period)| period.pushed);
+    let pushes: Vec<f64> = pushed.map(|(frame, _)| motion.time(frame)).collect();
+    let title = summary.title();
+    let contact = Sheet {
         title: &title,
-        subtitle: &subtitle,
+        subtitle: &summary.contact_subtitle(),
         moments: &moments,
     };
-    sheet
-        .png()
-        .with_context(|| format!("cannot draw {}", robot.name()))
+    let stance = StanceSheet {
+        title: &title,
+        subtitle: &summary.stance_subtitle(),
+        moments: &moments,
+        stances: &stances,
+        rate: robot.control_rate_hz(),
+        fall: summary.fall().map(|fall| fall.time),
+        pushes: &pushes,
+    };
+    let context = || format!("cannot draw {}", robot.name());
+    Ok([
+        contact.png().with_context(context)?,
+        stance.png().with_context(context)?,
+    ])
+}
+
+/// The frame in which the base was tilted most.
+fn most_tilted(postures: &[Posture]) -> Option<usize> {
+    let tilt = |index: &usize| postures[*index].stance.tilt();
+    (0..postures.len()).max_by(|a, b| tilt(a).total_cmp(&tilt(b)))
+}
+
+/// The last frame, if the robot fell in it.
+fn last_of_fall(run: &Run) -> Option<usize> {
+    run.fall.and_then(|_| run.periods.len().checked_sub(1))
 }
 
 /// Writes every file under a temporary name and renames it when it is whole.
 pub(crate) fn write(
     out: &Path,
     robot: &Robot,
-    answers: &Answers,
+    run: &Run,
     summary: &Summary,
-    sheet: &[u8],
+    sheets: &[Vec<u8>; 2],
 ) -> Result<()> {
-    let [joints, json, picture] = FILES.map(|name| out.join(name));
-    write_joints(&joints, robot, &answers.targets)?;
+    let [joints, json, contact, stance] = FILES.map(|name| out.join(name));
+    write_joints(&joints, robot, run)?;
     write_whole(&json, summary.json()?.as_bytes())?;
-    write_whole(&picture, sheet)
+    write_whole(&contact, &sheets[0])?;
+    write_whole(&stance, &sheets[1])
 }
 
-fn write_joints(path: &Path, robot: &Robot, targets: &[Vec<f32>]) -> Result<()> {
-    let names: Vec<&str> = robot
-        .goal_joints()
-        .iter()
-        .map(|joint| joint.name.as_str())
-        .collect();
+/// A row a frame: the goals as the retargeter answered, what all motors followed, and what was then measured.
+fn write_joints(path: &Path, robot: &Robot, run: &Run) -> Result<()> {
+    let named =
+        |what: &'static str| move |joint: &emp_robot::Joint| format!("{what}:{}", joint.name);
+    let goals = robot.goal_joints().iter().map(named("goal"));
+    let executed = robot.joints().map(named("executed"));
+    let measured = robot.joints().map(named("measured"));
+    let names: Vec<String> = goals.chain(executed).chain(measured).collect();
     let mut csv = JointCsvWriter::create(path, &names)?;
-    for (frame, angles) in targets.iter().enumerate() {
-        csv.write_row(frame as f64 / robot.control_rate_hz(), angles)?;
+    for (frame, period) in run.periods.iter().enumerate() {
+        let row = [
+            period.goal.as_slice(),
+            &period.targets.goal,
+            &period.targets.legs,
+            &period.reading.joint_positions,
+        ];
+        csv.write_row(frame as f64 / robot.control_rate_hz(), &row.concat())?;
     }
     Ok(csv.finish()?)
 }

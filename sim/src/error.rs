@@ -2,8 +2,6 @@
 
 use mujoco_rs::prelude::MjDataError;
 
-use crate::Divergence;
-
 /// Why a simulation could not be run to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
@@ -26,14 +24,6 @@ pub enum SimError {
         joint: String,
         /// The angle.
         value: f32,
-    },
-    /// The physics left what it can compute: its state is not to be trusted from this frame on.
-    #[error("frame {frame}: the simulation diverged: {reason}")]
-    Diverged {
-        /// Index of the frame.
-        frame: usize,
-        /// What is wrong with it.
-        reason: Divergence,
     },
     /// A collision pair names a geom that the compiled model lacks.
     #[error("the model has no geom {geom:?}, which a collision pair names")]

@@ -16,6 +16,7 @@ pub(super) type Rgb = [u8; 3];
 #[derive(Clone, Copy)]
 pub(super) enum Align {
     Left,
+    Center,
     Right,
 }
 
@@ -41,6 +42,22 @@ impl Canvas {
             return;
         };
         self.stroke(&path, width, rgb);
+    }
+
+    /// A straight line of dashes, `dash` pixels long and as far apart.
+    pub(super) fn dashes(&mut self, [from, to]: [Point; 2], dash: f32, width: f32, rgb: Rgb) {
+        let (x, y) = (to.0 - from.0, to.1 - from.1);
+        let length = x.hypot(y).max(f32::MIN_POSITIVE);
+        let at = |distance: f32| {
+            let share = (distance / length).min(1.0);
+            (from.0 + share * x, from.1 + share * y)
+        };
+        for start in (0..).map(|number| 2.0 * dash * number as f32) {
+            if start >= length {
+                break;
+            }
+            self.line(&[at(start), at(start + dash)], width, rgb);
+        }
     }
 
     /// A filled area with round corners: `rounding` is what it grows by to every side.
@@ -72,12 +89,12 @@ impl Canvas {
 
     /// One line of text; `at` is on its base line, `size` the font's height in pixels.
     pub(super) fn text(&mut self, at: Point, size: f32, align: Align, rgb: Rgb, text: &str) {
-        let scale = size / f32::from(self.font.units_per_em());
+        let scale = self.font_scale(size);
         let glyphs: Vec<(GlyphId, f32)> = text.chars().map(|letter| self.glyph(letter)).collect();
-        let width: f32 = glyphs.iter().map(|(_, advance)| advance * scale).sum();
         let mut x = match align {
             Align::Left => at.0,
-            Align::Right => at.0 - width,
+            Align::Center => at.0 - self.text_width(size, text) / 2.0,
+            Align::Right => at.0 - self.text_width(size, text),
         };
         for (glyph, advance) in glyphs {
             let mut outline = Outline {
@@ -92,6 +109,16 @@ impl Canvas {
             }
             x += advance * scale;
         }
+    }
+
+    /// Width in pixels of a text of this size.
+    pub(super) fn text_width(&self, size: f32, text: &str) -> f32 {
+        let advances = text.chars().map(|letter| self.glyph(letter).1);
+        advances.sum::<f32>() * self.font_scale(size)
+    }
+
+    fn font_scale(&self, size: f32) -> f32 {
+        size / f32::from(self.font.units_per_em())
     }
 
     /// The picture as a PNG file.

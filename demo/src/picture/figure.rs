@@ -1,7 +1,7 @@
 //! From key nodes to something with a body: limbs, a trunk and a head in space.
 
 use emp_motion::{KeyNode, KeyNodeFrame, Side};
-use nalgebra::Vector3;
+use nalgebra::{Isometry3, Point3, Vector3};
 
 /// Which part of a body a shape belongs to; decides its colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -12,7 +12,7 @@ pub(super) enum Part {
     Limb(Side),
 }
 
-/// A shape in the pelvis frame, metres.
+/// A shape in the figure's frame, metres.
 pub(super) enum Shape {
     /// A round rod through points, and the joints that show on it.
     Rod {
@@ -58,6 +58,14 @@ impl Figure {
             figure.leg(&legs[side as usize], side, size);
         }
         figure
+    }
+
+    /// The figure elsewhere: every point moved by `placement`.
+    pub(super) fn placed(mut self, placement: &Isometry3<f32>) -> Self {
+        for (_, shape) in &mut self.shapes {
+            shape.each_point(|point| *point = (placement * Point3::from(*point)).coords);
+        }
+        self
     }
 
     fn with_arms(frame: &KeyNodeFrame, joints: bool) -> Self {
@@ -174,6 +182,14 @@ impl Shape {
             Self::Rod { points, .. } => points,
             Self::Slab { corners, .. } => corners,
             Self::Ball { center, .. } => std::slice::from_ref(center),
+        }
+    }
+
+    fn each_point(&mut self, change: impl FnMut(&mut Vector3<f32>)) {
+        match self {
+            Self::Rod { points, joints, .. } => points.iter_mut().chain(joints).for_each(change),
+            Self::Slab { corners, .. } => corners.iter_mut().for_each(change),
+            Self::Ball { center, .. } => std::iter::once(center).for_each(change),
         }
     }
 

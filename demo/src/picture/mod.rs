@@ -1,9 +1,45 @@
-//! The contact sheet: what the person did above what the robot did, at moments that differ.
+//! The pictures: what the person did above what the robot did, and how the robot stood meanwhile.
 
 mod canvas;
+mod chart;
 mod figure;
 mod moments;
 mod sheet;
+mod stance_sheet;
+#[cfg(test)]
+mod testing;
+mod view;
+
+use emp_motion::KeyNodeFrame;
+
+use crate::stance::Stance;
+use figure::{Figure, Leg};
 
 pub(crate) use moments::differing;
-pub(crate) use sheet::{Moment, Sheet};
+pub(crate) use sheet::Sheet;
+pub(crate) use stance_sheet::StanceSheet;
+
+/// One moment of the motion.
+pub(crate) struct Moment {
+    /// Since the motion began, seconds.
+    pub(crate) time: f64,
+    /// What is going on, if that has a name.
+    pub(crate) name: String,
+    /// Mean angle between the person's and the robot's arm bones, degrees.
+    pub(crate) direction_error_deg: f32,
+    /// The person.
+    pub(crate) human: KeyNodeFrame,
+    /// The robot's key nodes, as the physics left them, in the frame of its base.
+    pub(crate) robot: KeyNodeFrame,
+    /// The robot's left and right leg in the same frame.
+    pub(crate) legs: [Leg; 2],
+    /// How it stands.
+    pub(crate) stance: Stance,
+}
+
+impl Moment {
+    /// The robot in the frame of its base.
+    fn robot_figure(&self) -> Figure {
+        Figure::robot(&self.robot, &self.legs)
+    }
+}

@@ -4,15 +4,24 @@ use emp_motion::{KeyNode, KeyNodeFrame};
 
 /// Frames that differ most from one another, in order of time: each next one is the frame farthest from all chosen ones.
 ///
-/// At most `count`, fewer where the motion is shorter. No two lie closer together than a third of their mean distance,
-/// so that the whole motion is covered.
-pub(crate) fn differing(frames: &[KeyNodeFrame], count: usize) -> Vec<usize> {
+/// At most `count`, fewer where the motion is shorter. The `fixed` frames are among them; no other lies closer to a chosen one
+/// than a third of their mean distance, so that the whole motion is covered.
+pub(crate) fn differing(frames: &[KeyNodeFrame], fixed: &[usize], count: usize) -> Vec<usize> {
     let gap = frames.len() / (3 * count.max(1));
+    let mut chosen: Vec<usize> = fixed.to_vec();
+    chosen.sort_unstable();
+    chosen.dedup();
+    // Without any, the first is the one that is farthest from the beginning.
     let mut novelty: Vec<f32> = frames
         .iter()
-        .map(|frame| distance(frame, &frames[0]))
+        .map(|frame| {
+            nearest(
+                frame,
+                frames,
+                if chosen.is_empty() { &[0] } else { &chosen },
+            )
+        })
         .collect();
-    let mut chosen = Vec::new();
     while chosen.len() < count.min(frames.len()) {
         let far = |index: usize| {
             chosen
@@ -37,6 +46,12 @@ pub(crate) fn differing(frames: &[KeyNodeFrame], count: usize) -> Vec<usize> {
     chosen
 }
 
+/// Distance of a pose from the nearest of those with the given numbers, metres.
+fn nearest(frame: &KeyNodeFrame, frames: &[KeyNodeFrame], others: &[usize]) -> f32 {
+    let distances = others.iter().map(|&other| distance(frame, &frames[other]));
+    distances.fold(f32::INFINITY, f32::min)
+}
+
 /// Distance of two poses: how far elbows and wrists are apart, metres.
 fn distance(a: &KeyNodeFrame, b: &KeyNodeFrame) -> f32 {
     [
@@ -59,7 +74,7 @@ mod tests {
     #[test]
     fn moments_are_in_order_apart_and_cover_the_farthest_pose() {
         let clip = skills::medley(3);
-        let moments = differing(&clip.frames, 8);
+        let moments = differing(&clip.frames, &[], 8);
         assert_eq!(moments.len(), 8);
         let gap = clip.frames.len() / 24;
         assert!(
@@ -77,7 +92,16 @@ mod tests {
     #[test]
     fn a_short_motion_has_as_many_moments_as_frames() {
         let frames = &skills::generate(Skill::Wave, 1).frames[..3];
-        assert_eq!(differing(frames, 8), [0, 1, 2]);
-        assert!(differing(&[], 8).is_empty());
+        assert_eq!(differing(frames, &[], 8), [0, 1, 2]);
+        assert!(differing(&[], &[], 8).is_empty());
+    }
+
+    #[test]
+    fn fixed_moments_are_among_them() {
+        let clip = skills::medley(3);
+        let last = clip.frames.len() - 1;
+        let moments = differing(&clip.frames, &[last, last - 1, last], 8);
+        assert_eq!(moments.len(), 8);
+        assert!(moments.ends_with(&[last - 1, last]), "{moments:?}");
     }
 }

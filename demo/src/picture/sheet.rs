@@ -1,20 +1,12 @@
-//! Layout of the contact sheet, and the camera.
+//! The contact sheet: the person above the robot at moments that differ.
 
 use anyhow::{Result, ensure};
-use emp_motion::{KeyNodeFrame, Side};
-use nalgebra::Vector3;
+use nalgebra::{Isometry3, Translation3};
 
-use super::canvas::{Align, Canvas, Point, Rgb};
-use super::figure::{Figure, Leg, Part, Shape};
-
-const BACKGROUND: Rgb = [255, 255, 255];
-const PANEL: Rgb = [244, 246, 248];
-const INK: Rgb = [38, 46, 56];
-const FAINT: Rgb = [120, 130, 142];
-const GROUND: Rgb = [205, 211, 218];
-const MIDDLE: Rgb = [96, 108, 122];
-const LEFT: Rgb = [0, 114, 178];
-const RIGHT: Rgb = [213, 94, 0];
+use super::Moment;
+use super::canvas::{Align, Canvas, Point};
+use super::figure::Figure;
+use super::view::{BACKGROUND, Bounds, Camera, FAINT, GROUND, INK, LEFT, PANEL, RIGHT, View};
 
 const COLUMNS: usize = 4;
 const CELL_WIDTH: f32 = 400.0;
@@ -24,26 +16,8 @@ const CAPTION: f32 = 70.0;
 const GAP: f32 = 20.0;
 /// Between a cell's border and its text, pixels.
 const INSET: f32 = 16.0;
-/// Width of the edge around shapes, pixels.
-const EDGE: f32 = 3.0;
 /// Free space around the figures of a cell, pixels.
 const PADDING: f32 = 24.0;
-
-/// One moment of the motion.
-pub(crate) struct Moment {
-    /// Since the motion began, seconds.
-    pub(crate) time: f64,
-    /// What is going on, if that has a name.
-    pub(crate) name: String,
-    /// Mean angle between the person's and the robot's arm bones, degrees.
-    pub(crate) direction_error_deg: f32,
-    /// The person.
-    pub(crate) human: KeyNodeFrame,
-    /// The robot's key nodes, as the physics left them, in its pelvis frame.
-    pub(crate) robot: KeyNodeFrame,
-    /// The robot's left and right leg.
-    pub(crate) legs: [Leg; 2],
-}
 
 /// A contact sheet.
 pub(crate) struct Sheet<'a> {
@@ -92,177 +66,9 @@ impl Sheet<'_> {
 impl Moment {
     fn views(&self, camera: &Camera) -> [View; 2] {
         let human = Figure::person(&self.human);
-        let robot = Figure::robot(&self.robot, &self.legs);
+        let tilt = Isometry3::from_parts(Translation3::identity(), self.stance.base.rotation);
+        let robot = self.robot_figure().placed(&tilt);
         [human, robot].map(|figure| View::new(&figure, camera))
-    }
-}
-
-/// A parallel projection.
-struct Camera {
-    right: Vector3<f32>,
-    up: Vector3<f32>,
-    /// From the figure to the camera.
-    toward: Vector3<f32>,
-}
-
-impl Camera {
-    /// In front of the figure, somewhat to its left and above: depth shows, and neither arm hides the other.
-    fn front_left() -> Self {
-        let (azimuth, elevation) = (28_f32.to_radians(), 12_f32.to_radians());
-        let toward = Vector3::new(
-            azimuth.cos() * elevation.cos(),
-            azimuth.sin() * elevation.cos(),
-            elevation.sin(),
-        );
-        let right = (-toward).cross(&Vector3::z()).normalize();
-        Self {
-            right,
-            up: right.cross(&-toward),
-            toward,
-        }
-    }
-
-    /// Metres to the right and up, seen from the camera.
-    fn project(&self, point: &Vector3<f32>) -> Point {
-        (self.right.dot(point), self.up.dot(point))
-    }
-
-    /// Nearness to the camera, metres.
-    fn depth(&self, point: &Vector3<f32>) -> f32 {
-        self.toward.dot(point)
-    }
-}
-
-/// A figure as the camera sees it: flat shapes from far to near.
-struct View {
-    shapes: Vec<FlatShape>,
-    bounds: Bounds,
-}
-
-/// A shape in camera metres.
-struct FlatShape {
-    color: Rgb,
-    depth: f32,
-    points: Vec<Point>,
-    kind: Kind,
-}
-
-/// How the points of a flat shape are joined; sizes in metres.
-enum Kind {
-    Rod { width: f32, joints: Vec<Point> },
-    Slab { rounding: f32 },
-    Ball { radius: f32 },
-}
-
-/// What a figure spans, in camera metres.
-#[derive(Clone, Copy)]
-struct Bounds {
-    left: f32,
-    right: f32,
-    bottom: f32,
-    top: f32,
-}
-
-impl Bounds {
-    const NONE: Self = Self {
-        left: f32::INFINITY,
-        right: f32::NEG_INFINITY,
-        bottom: f32::INFINITY,
-        top: f32::NEG_INFINITY,
-    };
-
-    fn with(self, (x, y): Point, margin: f32) -> Self {
-        Self {
-            left: self.left.min(x - margin),
-            right: self.right.max(x + margin),
-            bottom: self.bottom.min(y - margin),
-            top: self.top.max(y + margin),
-        }
-    }
-
-    fn union(self, other: Self) -> Self {
-        self.with((other.left, other.bottom), 0.0)
-            .with((other.right, other.top), 0.0)
-    }
-
-    fn height(&self) -> f32 {
-        self.top - self.bottom
-    }
-
-    /// Largest distance to either side of the pelvis.
-    fn half_width(&self) -> f32 {
-        self.right.max(-self.left)
-    }
-}
-
-impl View {
-    fn new(figure: &Figure, camera: &Camera) -> Self {
-        let mut bounds = Bounds::NONE;
-        let mut shapes = Vec::new();
-        for (part, shape) in &figure.shapes {
-            let points: Vec<Point> = shape
-                .points()
-                .iter()
-                .map(|point| camera.project(point))
-                .collect();
-            bounds = points
-                .iter()
-                .fold(bounds, |bounds, &point| bounds.with(point, shape.margin()));
-            let depths = shape.points().iter().map(|point| camera.depth(point));
-            let depth = depths.sum::<f32>() / shape.points().len() as f32;
-            let kind = match shape {
-                Shape::Rod { width, joints, .. } => {
-                    let joints = joints.iter().map(|joint| camera.project(joint)).collect();
-                    Kind::Rod {
-                        width: *width,
-                        joints,
-                    }
-                }
-                Shape::Slab { rounding, .. } => Kind::Slab {
-                    rounding: *rounding,
-                },
-                Shape::Ball { radius, .. } => Kind::Ball { radius: *radius },
-            };
-            shapes.push(FlatShape {
-                color: tint(*part),
-                depth,
-                points,
-                kind,
-            });
-        }
-        shapes.sort_by(|a, b| a.depth.total_cmp(&b.depth));
-        Self { shapes, bounds }
-    }
-
-    /// Draws the figure with the pelvis at `origin`, at `scale` pixels a metre.
-    fn draw(&self, canvas: &mut Canvas, origin: Point, scale: f32) {
-        let place = |&(x, y): &Point| (origin.0 + x * scale, origin.1 - y * scale);
-        for shape in &self.shapes {
-            let points: Vec<Point> = shape.points.iter().map(place).collect();
-            // An edge in the colour of the background parts a shape from what lies behind it.
-            for (edge, color) in [(EDGE, PANEL), (0.0, shape.color)] {
-                match &shape.kind {
-                    Kind::Rod { width, .. } => {
-                        canvas.line(&points, width * scale + 2.0 * edge, color);
-                    }
-                    Kind::Slab { rounding } => canvas.area(&points, rounding * scale + edge, color),
-                    Kind::Ball { radius } => canvas.disc(points[0], radius * scale + edge, color),
-                }
-            }
-            if let Kind::Rod { width, joints } = &shape.kind {
-                for joint in joints {
-                    canvas.disc(place(joint), 0.22 * width * scale, PANEL);
-                }
-            }
-        }
-    }
-}
-
-fn tint(part: Part) -> Rgb {
-    match part {
-        Part::Middle => MIDDLE,
-        Part::Limb(Side::Left) => LEFT,
-        Part::Limb(Side::Right) => RIGHT,
     }
 }
 
@@ -408,33 +214,11 @@ fn caption(canvas: &mut Canvas, (left, top): Point, moment: &Moment) {
 
 #[cfg(test)]
 mod tests {
-    use emp_motion::skills;
     use tiny_skia::Pixmap;
 
+    use super::super::canvas::Rgb;
+    use super::super::testing::moment;
     use super::*;
-
-    fn moment(time: f64) -> Moment {
-        let frame = skills::medley(1).frames[(time * 50.0) as usize].clone();
-        let leg = |y: f32| {
-            [
-                (0.0, -0.1),
-                (0.1, -0.45),
-                (0.0, -0.8),
-                (-0.1, -0.85),
-                (0.15, -0.85),
-            ]
-            .map(|(x, z)| Vector3::new(x, y, z))
-            .to_vec()
-        };
-        Moment {
-            time,
-            name: "reach-overhead".to_owned(),
-            direction_error_deg: 1.0,
-            human: frame.clone(),
-            robot: frame,
-            legs: [leg(0.1), leg(-0.1)],
-        }
-    }
 
     fn draw(moments: &[Moment]) -> Pixmap {
         let png = Sheet {

@@ -200,7 +200,7 @@ fn different(index: usize) -> BodyParameters {
     }
 }
 
-/// Whole rollouts, resets between them included.
+/// Whole rollouts, resets of robots that fall or time out included.
 fn rollouts(
     robot: &Arc<Robot>,
     pool: &Arc<Pool>,
@@ -210,7 +210,6 @@ fn rollouts(
 ) -> impl FnMut() -> Duration + use<> {
     let config = EnvironmentConfig {
         randomization,
-        episode_frames: 2 * PERIODS,
         ..EnvironmentConfig::default()
     };
     let environments = VecEnvironment::new(

@@ -1,16 +1,17 @@
 //! The command line.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, str::FromStr};
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 
-/// Sends recorded human motion to an emp-server and writes the robot's joint targets.
+/// Sends recorded human motion to an emp-server and writes the robot's joint targets, or has a controller evaluated there.
 ///
 /// Start a server with `emp-server`; it prints the address that it listens on. Then, for example:
 ///
 ///   emp robots
 ///   emp retarget walk.bvh --robot emp27 --refine --smooth --out joints.csv
 ///   emp retarget walk.bvh --robot emp27 --realtime --out joints.csv
+///   emp evaluate --robot emp27 --motions recordings/ --procedural 100 --csv episodes.csv
 ///
 /// Exit codes: 0 done; 1 failed (whatever was received is written); 2 wrong usage; 3 done, but frames are missing though
 /// every frame was asked for; 130 interrupted (Ctrl-C; whatever was received is written).
@@ -47,6 +48,14 @@ pub(crate) enum Command {
     /// A lost connection is restored with growing pauses, for up to a minute; frames without an answer are sent again
     /// (dropped with --realtime).
     Retarget(Retarget),
+    /// Evaluate a controller on a set of motions
+    ///
+    /// The server retargets the motions, cuts them into clips and simulates a robot on each. SUC, MJP, MSC, MBV, MBA, MBO
+    /// and MUS are printed with 95 % intervals, recorded and procedural motion apart, beside how fast and how wide the
+    /// goals moved; then every clip that failed, with the time and the reason. The same request gives the same numbers.
+    ///
+    /// After Ctrl-C, or when the server is lost, what finished is reported and written.
+    Evaluate(Evaluate),
     /// List the robots that the server serves
     Robots,
     /// List the models that the server serves
@@ -74,4 +83,106 @@ pub(crate) struct Retarget {
     /// Smooth the joint angles over time, at the cost of at most one frame of delay
     #[arg(long)]
     pub(crate) smooth: bool,
+}
+
+/// What to evaluate, and how.
+#[derive(Args)]
+pub(crate) struct Evaluate {
+    /// Name of the robot, as `emp robots` lists it
+    #[arg(long, value_name = "NAME")]
+    pub(crate) robot: String,
+    /// `decoupled`, or a filter of goals before the policy, with parameters as `NAME:key=value,…`; an unknown one is
+    /// answered with those that there are
+    #[arg(long, value_name = "NAME", default_value = "decoupled")]
+    pub(crate) controller: String,
+    /// Folders (searched recursively) or files of recorded motion: BVH, AMASS, key nodes
+    #[arg(long, value_name = "DIR", num_args = 1.., required_unless_present = "procedural")]
+    pub(crate) motions: Vec<PathBuf>,
+    /// Number of procedural motions, 3 to 20 s each, drawn from the seed
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) procedural: u32,
+    /// Number of episodes; the clips are taken in turn [default: one a clip]
+    #[arg(long, value_name = "N")]
+    pub(crate) episodes: Option<u32>,
+    /// Seed of everything random
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Length of a clip in control periods [default: 200]
+    #[arg(long, value_name = "N")]
+    pub(crate) frames: Option<u32>,
+    /// Mass in each hand, kilograms, drawn per episode [default: 0.8..1.2]
+    #[arg(long, value_name = "LEAST..MOST")]
+    pub(crate) load: Option<Range>,
+    /// Speed of pushes, m/s [default: none, with full randomization the paper's]
+    #[arg(long, value_name = "M/S")]
+    pub(crate) push: Option<f64>,
+    /// Speed of the motions, as a multiple of their own [default: 1]
+    #[arg(long, value_name = "FACTOR")]
+    pub(crate) speed: Option<f64>,
+    /// Scale of the goals' distance from the default pose [default: 1]
+    #[arg(long, value_name = "FACTOR")]
+    pub(crate) amplitude: Option<f64>,
+    /// How much the robots differ from the model
+    #[arg(long, value_enum, default_value_t = Randomization::Nominal)]
+    pub(crate) randomization: Randomization,
+    /// Where to write one row an episode
+    #[arg(long, value_name = "FILE")]
+    pub(crate) csv: Option<PathBuf>,
+}
+
+/// How much simulated robots differ from the model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Randomization {
+    /// Only the load in the hands.
+    Nominal,
+    /// The paper's whole table.
+    Full,
+}
+
+/// Two numbers, written `LEAST..MOST`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Range {
+    pub(crate) least: f64,
+    pub(crate) most: f64,
+}
+
+impl FromStr for Range {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let expected = || "expected LEAST..MOST, for example 0.8..1.2".to_owned();
+        let (least, most) = text.split_once("..").ok_or_else(expected)?;
+        let number = |text: &str| text.trim().parse::<f64>().map_err(|_| expected());
+        Ok(Self {
+            least: number(least)?,
+            most: number(most)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_sound() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn ranges_are_two_numbers() {
+        let range = "0.8..1.2".parse();
+        assert_eq!(
+            range,
+            Ok(Range {
+                least: 0.8,
+                most: 1.2
+            })
+        );
+        for bad in ["", "1", "1..", "a..b"] {
+            assert!(bad.parse::<Range>().is_err(), "{bad}");
+        }
+    }
 }

@@ -2,16 +2,17 @@
 
 use std::time::{Duration, Instant};
 
-use emp_motion::KeyNodeFrame;
+use emp_motion::{Clip, KeyNodeFrame};
 use emp_proto::v1::{
-    GetModelRequest, GetRobotRequest, ListModelsRequest, Model, RetargetRequest, Robot,
-    model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
+    CollectRolloutsConfig, EvaluateConfig, GetModelRequest, GetRobotRequest, GoalClip,
+    ListModelsRequest, Model, RetargetRequest, Robot, model_service_client::ModelServiceClient,
+    motion_service_client::MotionServiceClient,
 };
 use tonic::transport::{Channel, Endpoint};
 
 use crate::{
-    Answer, Backoff, ClientError, FrameSender, PolicyAnswer, PolicyConfig, RobotFrame,
-    StreamConfig, StreamEvents, driver, wire,
+    Answer, Backoff, ClientError, Collection, Evaluation, FrameSender, PolicyAnswer, PolicyConfig,
+    RobotFrame, StreamConfig, StreamEvents, driver, wire,
 };
 
 /// How long a connection may take to stand.
@@ -146,6 +147,30 @@ impl Client {
         config: PolicyConfig,
     ) -> Result<(FrameSender<RobotFrame>, StreamEvents<PolicyAnswer>), ClientError> {
         driver::start(self.motion_service(), config, self.backoff).await
+    }
+
+    /// Has a controller evaluated on recorded motions, beside the procedural ones of the config.
+    ///
+    /// # Errors
+    /// When the server cannot be reached. What else it refuses, the evaluation's messages say.
+    pub async fn evaluate(
+        &self,
+        config: EvaluateConfig,
+        motions: Vec<Clip>,
+    ) -> Result<Evaluation, ClientError> {
+        Evaluation::start(self.channel.clone(), config, motions).await
+    }
+
+    /// Places simulated robots on the server, for a learner. The config's number of clips is set to that of `library`.
+    ///
+    /// # Errors
+    /// When the server refuses.
+    pub async fn collect_rollouts(
+        &self,
+        config: CollectRolloutsConfig,
+        library: Vec<GoalClip>,
+    ) -> Result<Collection, ClientError> {
+        Collection::start(self.channel.clone(), config, library).await
     }
 
     fn motion_service(&self) -> MotionServiceClient<Channel> {

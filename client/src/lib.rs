@@ -34,14 +34,22 @@ mod client;
 mod driver;
 mod error;
 mod kind;
+mod rollouts;
 mod statistics;
 mod stream;
 mod wire;
 
 pub use backoff::Backoff;
 pub use client::Client;
-pub use emp_proto::v1::{Delivery, DropReason, Joint, KeyNode, Model, Robot};
+pub use emp_proto::v1::{
+    ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig, CollectStarted, Delivery,
+    DropReason, EpisodeEnd, EpisodeFinished, EpisodeMetrics, EpisodeResult, EvaluateConfig,
+    EvaluationMetrics, EvaluationResult, EvaluationStarted, GoalClip, GoalStatistics, Joint,
+    KeyNode, MassRange, Metric, Model, ProceduralClips, Randomization, Robot, RolloutBlock, Spread,
+    StepEnd, TrainingEnd, evaluate_response::Message as EvaluationEvent,
+};
 pub use error::ClientError;
+pub use rollouts::{Collection, Evaluation};
 pub use statistics::{
     BatchStatistics, Counted, DirectionError, Percentiles, RetargetingSummary, Statistics, Summary,
 };

@@ -1,8 +1,9 @@
-//! `emp`: human motion files in, robot joint targets out, by way of a server.
+//! `emp`: human motion files in, robot joint targets or a controller's metrics out, by way of a server.
 
 #![forbid(unsafe_code)]
 
 mod cli;
+mod evaluate;
 mod report;
 mod retarget;
 
@@ -40,6 +41,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let client = emp_client::Client::connect(&arguments.server).await?;
     match arguments.command {
         Command::Retarget(command) => retarget::run(&client, &command, arguments.json).await,
+        Command::Evaluate(command) => evaluate::run(&client, &command, arguments.json).await,
         Command::Robots => report::robots(&client, arguments.json).await,
         Command::Models => report::models(&client, arguments.json).await,
     }

@@ -224,7 +224,7 @@ impl Catalog {
         model: &str,
         version: &str,
     ) -> Result<&Arc<RetargetModel>, ServiceError> {
-        self.check_robot(robot)?;
+        self.robot_for(robot)?;
         choose(
             &self.retargeters,
             "robot with a retargeter",
@@ -241,16 +241,16 @@ impl Catalog {
         model: &str,
         version: &str,
     ) -> Result<&Arc<PolicyModel>, ServiceError> {
-        self.check_robot(robot)?;
+        self.robot_for(robot)?;
         choose(&self.policies, "robot with a policy", robot, model, version)
     }
 
-    fn check_robot(&self, robot: &str) -> Result<(), ServiceError> {
-        if self.robots.contains_key(robot) {
-            return Ok(());
-        }
-        let served = names(self.robots.keys());
-        Err(not_served("robot", "robot", robot, served))
+    /// The robot that a request asks for.
+    pub(crate) fn robot_for(&self, robot: &str) -> Result<&Arc<Robot>, ServiceError> {
+        self.robots.get(robot).ok_or_else(|| {
+            let served = names(self.robots.keys());
+            not_served("robot", "robot", robot, served)
+        })
     }
 
     pub(crate) fn model(&self, name: &str) -> Result<&v1::Model, ServiceError> {

@@ -70,6 +70,8 @@ pub(crate) enum ServiceError {
     ModelFailed(String),
     #[error("the model is being rebuilt after a failure")]
     ModelUnavailable,
+    #[error("the job failed: {0}")]
+    JobFailed(String),
     #[error("the server is shutting down")]
     ShuttingDown,
     /// The transport ended the call (reset by the client, message too large, not decodable): its status stands.
@@ -106,7 +108,7 @@ impl ServiceError {
             Self::NotFound { .. } => Code::NotFound,
             Self::DeadlineExceeded => Code::DeadlineExceeded,
             Self::Overloaded { .. } => Code::ResourceExhausted,
-            Self::ModelFailed(_) => Code::Internal,
+            Self::ModelFailed(_) | Self::JobFailed(_) => Code::Internal,
             Self::ModelUnavailable | Self::ShuttingDown => Code::Unavailable,
             Self::Transport(status) => status.code(),
         }
@@ -121,6 +123,7 @@ impl ServiceError {
             Self::DeadlineExceeded => "DEADLINE_EXCEEDED",
             Self::Overloaded { .. } => "OVERLOADED",
             Self::ModelFailed(_) => "MODEL_FAILED",
+            Self::JobFailed(_) => "JOB_FAILED",
             Self::ModelUnavailable => "MODEL_UNAVAILABLE",
             Self::ShuttingDown => "SHUTTING_DOWN",
             Self::Transport(_) => "TRANSPORT",

@@ -1,7 +1,9 @@
 //! The gRPC server: it takes human poses and robot states off the wire, brings them to the models in batches, and sends
 //! joint targets back.
 //!
-//! Transport (`motion`, `models`, `session`) knows messages and deadlines; the core (`batcher`, `queue`) knows neither; a model
+//! Evaluations and rollouts are jobs (`rollouts`) on threads of their own, behind every stream.
+//!
+//! Transport (`motion`, `models`, `rollouts`, `session`) knows messages and deadlines; the core (`batcher`, `queue`) knows neither; a model
 //! is known only through [`Backend`]. Statuses are made in `error` and nowhere else. This crate never computes a joint
 //! angle itself, and it runs no model and no foreign code on a tokio thread.
 
@@ -18,6 +20,7 @@ mod motion;
 mod pose;
 mod queue;
 mod robot_state;
+mod rollouts;
 mod serve;
 mod session;
 mod settings;
@@ -27,6 +30,6 @@ pub use backend::{Backend, BackendError, BoxedBackend, Build, RetargetBackend};
 pub use catalog::{Catalog, CatalogError};
 pub use serve::{Drain, ServeError, Server};
 pub use settings::{
-    BatchingSettings, DEFAULT_SETTINGS, LogFormat, LogSettings, Overrides, Settings, SettingsError,
-    ShutdownSettings, StreamSettings,
+    BatchingSettings, DEFAULT_SETTINGS, LogFormat, LogSettings, Overrides, RolloutSettings,
+    Settings, SettingsError, ShutdownSettings, StreamSettings,
 };

@@ -9,6 +9,11 @@ use crate::{check, error::FieldError};
 /// Reads a pose and moves its origin to the waist. Field paths start at the message that holds `pose`.
 pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError> {
     let pose = pose.ok_or_else(|| FieldError::new("pose", "it is missing"))?;
+    read_at("pose", pose)
+}
+
+/// Reads a pose and moves its origin to the waist; `path` is where it stands in its message.
+pub(crate) fn read_at(path: &str, pose: &HumanPose) -> Result<KeyNodeFrame, FieldError> {
     let nodes = nodes(pose);
     let given = nodes.iter().flatten().count();
     let mut positions = [Vector3::zeros(); KEY_NODES];
@@ -16,9 +21,9 @@ pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError>
         let position = position.ok_or_else(|| {
             let description =
                 format!("it is missing; a pose has {KEY_NODES} key nodes, this one {given}");
-            FieldError::new(path(node.name()), description)
+            FieldError::new(format!("{path}.{}", node.name()), description)
         })?;
-        positions[node as usize] = read_position(node.name(), position)?;
+        positions[node as usize] = read_position(&format!("{path}.{}", node.name()), position)?;
     }
     let waist = positions[KeyNode::Waist as usize];
     for position in &mut positions {
@@ -26,11 +31,11 @@ pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError>
     }
     let wrist_rotations = [
         read_rotation(
-            "left_wrist_orientation",
+            &format!("{path}.left_wrist_orientation"),
             pose.left_wrist_orientation.as_ref(),
         )?,
         read_rotation(
-            "right_wrist_orientation",
+            &format!("{path}.right_wrist_orientation"),
             pose.right_wrist_orientation.as_ref(),
         )?,
     ];
@@ -38,9 +43,9 @@ pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError>
         positions,
         wrist_rotations,
     };
-    frame
-        .validate()
-        .map_err(|error| FieldError::new(field_of(&error), error.to_string()))?;
+    frame.validate().map_err(|error| {
+        FieldError::new(format!("{path}.{}", field_of(&error)), error.to_string())
+    })?;
     Ok(frame)
 }
 
@@ -58,22 +63,18 @@ fn nodes(pose: &HumanPose) -> [Option<&Position>; KEY_NODES] {
     ]
 }
 
-fn path(name: &str) -> String {
-    format!("pose.{name}")
-}
-
-fn read_position(name: &str, position: &Position) -> Result<Vector3<f32>, FieldError> {
+fn read_position(path: &str, position: &Position) -> Result<Vector3<f32>, FieldError> {
     let Position { x, y, z } = *position;
-    check::finite(&path(name), [("x", x), ("y", y), ("z", z)])?;
+    check::finite(path, [("x", x), ("y", y), ("z", z)])?;
     Ok(Vector3::new(x, y, z))
 }
 
 fn read_rotation(
-    name: &str,
+    path: &str,
     quaternion: Option<&Quaternion>,
 ) -> Result<Option<Rotation3<f32>>, FieldError> {
     quaternion
-        .map(|quaternion| check::rotation(&path(name), quaternion))
+        .map(|quaternion| check::rotation(path, quaternion))
         .transpose()
         .map(|rotation| rotation.map(|rotation| rotation.cast().to_rotation_matrix()))
 }
@@ -82,8 +83,8 @@ fn field_of(error: &FrameError) -> String {
     match error {
         FrameError::NotFinite { node }
         | FrameError::TooFar { node, .. }
-        | FrameError::EmptyBone { node, .. } => path(node),
-        FrameError::NotARotation { side } => path(&format!("{side}_wrist_orientation")),
+        | FrameError::EmptyBone { node, .. } => (*node).to_owned(),
+        FrameError::NotARotation { side } => format!("{side}_wrist_orientation"),
     }
 }
 

@@ -4,7 +4,10 @@ use std::{collections::BTreeSet, net::SocketAddr, sync::Arc, time::Duration};
 
 use emp_proto::{
     FILE_DESCRIPTOR_SET,
-    v1::{model_service_server::ModelServiceServer, motion_service_server::MotionServiceServer},
+    v1::{
+        model_service_server::ModelServiceServer, motion_service_server::MotionServiceServer,
+        rollout_service_server::RolloutServiceServer,
+    },
 };
 use tokio::{net::TcpListener, time::timeout};
 use tokio_stream::{StreamExt as _, StreamMap, wrappers::WatchStream};
@@ -13,18 +16,23 @@ use tonic::transport::{Server as Transport, server::TcpIncoming};
 use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
-    batcher::ModelState, catalog::Catalog, models::Models, motion::Motion, settings::Settings,
+    batcher::ModelState, catalog::Catalog, models::Models, motion::Motion, rollouts::Rollouts,
+    settings::Settings,
 };
 
 /// Names of the services in `grpc.health.v1`; the empty one is the whole server.
 const MOTION: &str = "emp.v1.MotionService";
 const MODELS: &str = "emp.v1.ModelService";
+const ROLLOUTS: &str = "emp.v1.RolloutService";
 const WHOLE: &str = "";
+const HEALTH: [&str; 4] = [WHOLE, MOTION, MODELS, ROLLOUTS];
 
 /// A silent connection is asked after this long, and closed when it does not answer in time.
 const KEEPALIVE: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(5)];
-/// Largest message of the services here: one pose takes about 200 bytes.
+/// Largest message that is about single frames: one pose takes about 200 bytes, fifteen robot states 4 KiB.
 const MAX_MESSAGE: usize = 256 << 10;
+/// Largest message of jobs: parts of motions, policies.
+const MAX_JOB_MESSAGE: usize = 16 << 20;
 /// Streams that a client may reset before they were accepted. h2's own 20 is too few for a client that cancels many
 /// calls at once; it would lose its connection.
 const MAX_RESETS: usize = 1_000;
@@ -100,7 +108,7 @@ impl Server {
     /// When the transport fails.
     pub async fn run(self, shutdown: CancellationToken) -> Result<Drain, ServeError> {
         let (reporter, health) = tonic_health::server::health_reporter();
-        for service in [WHOLE, MOTION, MODELS] {
+        for service in HEALTH {
             reporter
                 .set_service_status(service, ServingStatus::Serving)
                 .await;
@@ -124,6 +132,11 @@ impl Server {
             shutdown.clone(),
         );
         let models = Models::new(Arc::clone(&self.catalog));
+        let rollouts = Rollouts::new(
+            Arc::clone(&self.catalog),
+            &self.settings.rollouts,
+            shutdown.clone(),
+        );
         let incoming = TcpIncoming::from(self.listener).with_nodelay(Some(true));
         let serving = Transport::builder()
             .trace_fn(|request| tracing::info_span!("call", path = request.uri().path()))
@@ -135,6 +148,9 @@ impl Server {
             .add_service(reflect().build_v1alpha()?)
             .add_service(MotionServiceServer::new(motion).max_decoding_message_size(MAX_MESSAGE))
             .add_service(ModelServiceServer::new(models).max_decoding_message_size(MAX_MESSAGE))
+            .add_service(
+                RolloutServiceServer::new(rollouts).max_decoding_message_size(MAX_JOB_MESSAGE),
+            )
             .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
         tokio::pin!(serving);
 
@@ -183,7 +199,7 @@ async fn report_models(
 
 /// Tells those who watch that the server goes, and ends their watches, which would hold it up otherwise.
 async fn close_health(mut reporter: HealthReporter) {
-    for service in [WHOLE, MOTION, MODELS] {
+    for service in HEALTH {
         reporter
             .set_service_status(service, ServingStatus::NotServing)
             .await;

@@ -29,6 +29,8 @@ pub struct Settings {
     pub batching: BatchingSettings,
     /// Open streams.
     pub streams: StreamSettings,
+    /// Evaluations and rollouts.
+    pub rollouts: RolloutSettings,
     /// The end.
     pub shutdown: ShutdownSettings,
 }
@@ -80,6 +82,18 @@ pub struct StreamSettings {
     pub max_open: NonZeroUsize,
     /// Most frames of one stream that wait inside the server.
     pub buffer: NonZeroUsize,
+}
+
+/// Evaluations and rollouts.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RolloutSettings {
+    /// Most jobs at once.
+    pub max_jobs: NonZeroUsize,
+    /// Threads of each job; 0 for one a core.
+    pub threads: usize,
+    /// Most frames of motion that a call may send.
+    pub max_frames: NonZeroUsize,
 }
 
 /// The end.

@@ -12,7 +12,7 @@ pub(crate) fn timing<O>(answer: &Answer<O>) -> v1::Timing {
     v1::Timing {
         queue_time: Some(duration(answer.queue_time)),
         inference_time: Some(duration(answer.inference_time)),
-        batch_size: u32::try_from(answer.batch_size).unwrap_or(u32::MAX),
+        batch_size: count(answer.batch_size),
     }
 }
 
@@ -107,6 +107,11 @@ fn joint(joint: &Joint) -> v1::Joint {
         torque_limit: joint.torque_limit,
         velocity_limit: joint.velocity_limit,
     }
+}
+
+/// A count as messages have it.
+pub(crate) fn count(count: usize) -> u32 {
+    u32::try_from(count).unwrap_or(u32::MAX)
 }
 
 fn duration(duration: Duration) -> prost_types::Duration {

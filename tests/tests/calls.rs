@@ -254,7 +254,7 @@ async fn deadlines_end_calls_with_deadline_exceeded() -> anyhow::Result<()> {
 
     let mut call = Request::new(request(Some(good_pose())));
     call.metadata_mut()
-        .insert("grpc-timeout", MetadataValue::from_static("500m"));
+        .insert("grpc-timeout", MetadataValue::from_static("3S"));
     let status = within("the timeout", client.retarget(call))
         .await?
         .expect_err("late");

@@ -89,7 +89,7 @@ impl Kind for PolicyStream {
             model_version: card.version.clone(),
             goal_joint_names: wire::joint_names(robot.goal_joints()),
             leg_joint_names: wire::joint_names(robot.leg_joints()),
-            history: u32::try_from(history).unwrap_or(u32::MAX),
+            history: wire::count(history),
         }))
     }
 

@@ -1,0 +1,337 @@
+//! `Evaluate`: a controller on a set of motions.
+
+use std::sync::Arc;
+
+use emp_models::{controller::Controller, filters, retarget::Retargeter};
+use emp_motion::Clip;
+use emp_proto::v1::{
+    EpisodeFinished, EvaluateConfig, EvaluateRequest, EvaluateResponse, EvaluationPreparing,
+    EvaluationStarted, HumanPose, MotionClip, Randomization, evaluate_request::Message as Request,
+    evaluate_response::Message as Response,
+};
+use emp_robot::Robot;
+use emp_sim::{
+    SimError, environment,
+    evaluation::{Conditions, EpisodeResult, EvaluationSettings, Kick, Progress, evaluate},
+    goals::{GoalClip, Source},
+};
+use tonic::Streaming;
+
+use super::{
+    RolloutContext,
+    job::{self, Line, Place},
+    motion,
+    read::{self, Budget},
+    scores,
+};
+use crate::{
+    catalog::{PolicyModel, RetargetModel},
+    error::{FieldError, ServiceError},
+    pose, wire,
+};
+
+/// Frames of an evaluation clip, as in the paper.
+const CLIP_FRAMES: usize = 200;
+/// Most frames of an evaluation clip, and most episodes.
+const MAX_COUNT: u32 = 100_000;
+/// Most frames a second of a motion.
+const MAX_FPS: f64 = 1_000.0;
+/// Largest mass in a hand, kilograms.
+const MAX_LOAD: f64 = 20.0;
+
+type EvaluateLine = Line<EvaluateResponse>;
+
+/// What a call asks for.
+struct Plan {
+    policy: Arc<PolicyModel>,
+    retargeter: Arc<RetargetModel>,
+    network: Arc<Retargeter>,
+    controller: Controller,
+    settings: EvaluationSettings,
+    clip_frames: usize,
+    motions: Vec<Clip>,
+    /// Number and seed of the procedural motions.
+    procedural: (usize, u64),
+    place: Place,
+}
+
+/// Serves one call to its end.
+pub(super) async fn run(
+    context: RolloutContext,
+    mut inbound: Streaming<EvaluateRequest>,
+    line: EvaluateLine,
+) {
+    let Some(Plan {
+        policy,
+        retargeter,
+        network,
+        controller,
+        settings,
+        clip_frames,
+        motions,
+        procedural,
+        place,
+    }) = line.prepare(read_plan(&context, &mut inbound)).await
+    else {
+        return;
+    };
+    line.start(place, move |line, threads| {
+        let procedural = motion::procedural(procedural);
+        let clips = prepare(line, &network, [motions, procedural], clip_frames, threads)?;
+        let episodes = settings.episodes.unwrap_or(clips.len());
+        line.send(response(Response::Started(EvaluationStarted {
+            robot: policy.card.robot.clone(),
+            controller: controller.name().to_owned(),
+            model: policy.card.name.clone(),
+            model_version: policy.card.version.clone(),
+            retargeter: retargeter.card.name.clone(),
+            retargeter_version: retargeter.card.version.clone(),
+            episodes: wire::count(episodes),
+            control_rate: policy.robot.control_rate_hz(),
+        })))?;
+        let pool = job::pool(&policy.robot, threads).map_err(failed)?;
+        let mut reporter = Reporter::new(line, &policy.robot);
+        let evaluation =
+            evaluate(&pool, &controller, &clips, &settings, &mut reporter).map_err(failed)?;
+        // A job that had to stop has no metrics: they would be those of other episodes every time.
+        line.check()?;
+        line.send(response(Response::Result(scores::result(
+            &evaluation,
+            &policy.robot,
+        ))))
+    });
+}
+
+fn response(message: Response) -> EvaluateResponse {
+    EvaluateResponse {
+        message: Some(message),
+    }
+}
+
+fn failed(error: SimError) -> ServiceError {
+    ServiceError::JobFailed(error.to_string())
+}
+
+/// Retargets the recorded and the procedural motions, and cuts them into clips.
+fn prepare(
+    line: &EvaluateLine,
+    retargeter: &Retargeter,
+    motions: [Vec<Clip>; 2],
+    clip_frames: usize,
+    threads: usize,
+) -> Result<Vec<GoalClip>, ServiceError> {
+    let total: usize = motions.iter().map(Vec::len).sum();
+    let mut before = 0;
+    let mut clips = Vec::new();
+    for (motions, source) in motions.iter().zip([Source::Recorded, Source::Procedural]) {
+        let progress = |done: usize| {
+            line.check()?;
+            line.send(response(Response::Preparing(EvaluationPreparing {
+                done: wire::count(before + done),
+                motions: wire::count(total),
+            })))
+        };
+        let goals = motion::retarget(retargeter, motions, source, threads, progress)?;
+        clips.extend(goals.iter().flat_map(|clip| clip.windows(clip_frames)));
+        before += motions.len();
+    }
+    if clips.is_empty() {
+        let shortest = GoalClip::SHORTEST_WINDOW;
+        let description = format!("every motion is shorter than {shortest} control periods");
+        return Err(FieldError::new("clip.poses", description).into());
+    }
+    Ok(clips)
+}
+
+/// Reports episodes as they end.
+struct Reporter<'a> {
+    line: &'a EvaluateLine,
+    robot: &'a Robot,
+    finished: usize,
+    stood: usize,
+}
+
+impl<'a> Reporter<'a> {
+    fn new(line: &'a EvaluateLine, robot: &'a Robot) -> Self {
+        Self {
+            line,
+            robot,
+            finished: 0,
+            stood: 0,
+        }
+    }
+}
+
+impl Progress for Reporter<'_> {
+    fn finished(&mut self, episode: &EpisodeResult) {
+        self.finished += 1;
+        self.stood += usize::from(episode.failure.is_none());
+        // A client that is gone cancels the job, which is asked next.
+        let _ = self.line.send(response(Response::Episode(EpisodeFinished {
+            result: Some(scores::episode(episode, self.robot)),
+            finished: wire::count(self.finished),
+            success: self.stood as f64 / self.finished as f64,
+        })));
+    }
+
+    fn is_cancelled(&self) -> bool {
+        self.line.check().is_err()
+    }
+}
+
+async fn read_plan(
+    context: &RolloutContext,
+    inbound: &mut Streaming<EvaluateRequest>,
+) -> Result<Plan, ServiceError> {
+    let config = match read::message(inbound)
+        .await?
+        .and_then(|first| first.message)
+    {
+        Some(Request::Config(config)) => config,
+        _ => return Err(FieldError::missing_config().into()),
+    };
+    let policy = context
+        .catalog
+        .policy_for(&config.robot, &config.model, &config.model_version)?;
+    let retargeter = context.catalog.retargeter_for(&config.robot, "", "")?;
+    let network = motion::network(retargeter)?;
+    let controller = read_controller(&config.controller, policy)?;
+    let procedural = motion::read_procedural(config.procedural.as_ref())?;
+    let settings = read_settings(&config, &policy.robot)?;
+    let clip_frames = read::within("config.clip_frames", config.clip_frames, 0..=MAX_COUNT)?;
+    let place = context.jobs.enter()?;
+    let motions = read_motions(inbound, context.budget()).await?;
+    if motions.is_empty() && procedural.0 == 0 {
+        let description = "no motion was sent, and no procedural motion asked for";
+        return Err(FieldError::new("config.procedural", description).into());
+    }
+    Ok(Plan {
+        policy: Arc::clone(policy),
+        retargeter: Arc::clone(retargeter),
+        network,
+        controller,
+        settings,
+        clip_frames: match clip_frames {
+            0 => CLIP_FRAMES,
+            frames => frames as usize,
+        },
+        motions,
+        procedural,
+        place,
+    })
+}
+
+fn read_settings(config: &EvaluateConfig, robot: &Robot) -> Result<EvaluationSettings, FieldError> {
+    let conditions = match Randomization::try_from(config.randomization) {
+        Ok(Randomization::Unspecified | Randomization::Nominal) => Conditions::Nominal,
+        Ok(Randomization::Full) => Conditions::Full,
+        Err(_) => {
+            let description = format!(
+                "{}; expected a value of emp.v1.Randomization",
+                config.randomization
+            );
+            return Err(FieldError::new("config.randomization", description));
+        }
+    };
+    let hand_load = match config.hand_load {
+        Some(load) => {
+            let least = read::within("config.hand_load.least", load.least, 0.0..=MAX_LOAD)?;
+            let most = read::within("config.hand_load.most", load.most, least..=MAX_LOAD)?;
+            Some([least, most])
+        }
+        None => None,
+    };
+    let interval = environment::Randomization::default()
+        .push
+        .map(|push| push.interval);
+    let push = config.push.zip(interval);
+    let episodes = read::within("config.episodes", config.episodes, 0..=MAX_COUNT)?;
+    let settings = EvaluationSettings {
+        seed: config.seed,
+        episodes: (episodes > 0).then_some(episodes as usize),
+        conditions,
+        hand_load,
+        push: push.map(|(speed, interval)| Kick { speed, interval }),
+        speed: config.speed.unwrap_or(1.0),
+        amplitude: config.amplitude.unwrap_or(1.0),
+    };
+    settings.check(robot).map_err(|error| match error {
+        SimError::Setting {
+            name,
+            expected,
+            found,
+        } => {
+            let field = name.strip_suffix(".speed").unwrap_or(&name);
+            FieldError::new(
+                format!("config.{field}"),
+                format!("{found}; expected {expected}"),
+            )
+        }
+        error => FieldError::new("config", error.to_string()),
+    })?;
+    Ok(settings)
+}
+
+fn read_controller(name: &str, policy: &PolicyModel) -> Result<Controller, FieldError> {
+    let name = match name {
+        "" => Controller::DECOUPLED,
+        name => name,
+    };
+    let filter = filters::by_name(name, &policy.robot)
+        .map_err(|error| FieldError::new("config.controller", error.to_string()))?;
+    Ok(Controller::new(Arc::clone(policy.model.policy()), filter))
+}
+
+/// Reads motions until the client half-closes.
+async fn read_motions(
+    inbound: &mut Streaming<EvaluateRequest>,
+    mut budget: Budget,
+) -> Result<Vec<Clip>, ServiceError> {
+    let mut motions: Vec<Clip> = Vec::new();
+    while let Some(request) = read::message(inbound).await? {
+        match request.message {
+            Some(Request::Clip(clip)) => motions.push(read_clip(clip, &mut budget)?),
+            Some(Request::Poses(more)) => {
+                let clip = motions
+                    .last_mut()
+                    .ok_or_else(|| FieldError::new("poses", "they come before the first clip"))?;
+                read_poses("poses.poses", &more.poses, clip, &mut budget)?;
+            }
+            Some(Request::Config(_)) => return Err(FieldError::second_config().into()),
+            None => {
+                return Err(FieldError::new("message", "it is missing; expected a clip").into());
+            }
+        }
+    }
+    match motions.iter().find(|motion| motion.frames.is_empty()) {
+        Some(motion) => {
+            Err(FieldError::new("clip.poses", format!("motion {:?} has none", motion.name)).into())
+        }
+        None => Ok(motions),
+    }
+}
+
+fn read_clip(clip: MotionClip, budget: &mut Budget) -> Result<Clip, FieldError> {
+    let MotionClip { name, fps, poses } = clip;
+    let mut clip = Clip {
+        name: read::name("clip.name", name)?,
+        fps: read::within("clip.fps", fps, f64::MIN_POSITIVE..=MAX_FPS)?,
+        frames: Vec::new(),
+    };
+    read_poses("clip.poses", &poses, &mut clip, budget)?;
+    Ok(clip)
+}
+
+fn read_poses(
+    field: &str,
+    poses: &[HumanPose],
+    clip: &mut Clip,
+    budget: &mut Budget,
+) -> Result<(), FieldError> {
+    budget.spend(field, poses.len())?;
+    for (index, pose) in poses.iter().enumerate() {
+        let path = format!("{field}[{index}]");
+        clip.frames.push(pose::read_at(&path, pose)?);
+    }
+    Ok(())
+}

@@ -116,6 +116,9 @@ pub(crate) struct Evaluate {
     /// Speed of pushes, m/s [default: none, with full randomization the paper's]
     #[arg(long, value_name = "M/S")]
     pub(crate) push: Option<f64>,
+    /// Time between two pushes, seconds [default: 5]
+    #[arg(long, value_name = "S", requires = "push")]
+    pub(crate) push_interval: Option<f64>,
     /// Speed of the motions, as a multiple of their own [default: 1]
     #[arg(long, value_name = "FACTOR")]
     pub(crate) speed: Option<f64>,

@@ -7,7 +7,7 @@ use csv::Writer;
 use emp_client::{
     Client, ClientError, ClipSource, EpisodeEnd, EpisodeMetrics, EpisodeResult, EvaluateConfig,
     Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult, EvaluationStarted,
-    GoalStatistics, MassRange, Metric, ProceduralClips, Randomization, Spread,
+    GoalStatistics, MassRange, Metric, ProceduralClips, Push, Randomization, Spread,
 };
 use emp_motion::Clip;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -47,19 +47,32 @@ pub(crate) async fn run(
     // A job that goes on for nobody would keep others out.
     drop(evaluation);
     outcome.episodes.sort_by_key(|episode| episode.episode);
-    if let Some(path) = &command.csv {
-        write_csv(path, &outcome.episodes).with_context(|| path.display().to_string())?;
-    }
-    if as_json {
-        println!("{}", outcome.json(command));
-    } else {
-        outcome.print(command);
+    // Of an evaluation that never began there is nothing to report.
+    if let Some(started) = &outcome.started {
+        report(command, started, &outcome, as_json)?;
     }
     Ok(match end {
         End::Failed(error) => return Err(error.into()),
         End::Interrupted => ExitCode::from(INTERRUPTED),
         End::Complete => ExitCode::SUCCESS,
     })
+}
+
+fn report(
+    command: &Evaluate,
+    started: &EvaluationStarted,
+    outcome: &Outcome,
+    as_json: bool,
+) -> anyhow::Result<()> {
+    if let Some(path) = &command.csv {
+        write_csv(path, &outcome.episodes).with_context(|| path.display().to_string())?;
+    }
+    if as_json {
+        println!("{}", outcome.json(command, started));
+    } else {
+        outcome.print(command, started);
+    }
+    Ok(())
 }
 
 fn load(paths: &[std::path::PathBuf]) -> anyhow::Result<Vec<Clip>> {
@@ -87,7 +100,10 @@ fn config(command: &Evaluate) -> EvaluateConfig {
         hand_load: command
             .load
             .map(|cli::Range { least, most }| MassRange { least, most }),
-        push: command.push,
+        push: command.push.map(|speed| Push {
+            speed,
+            interval: command.push_interval.unwrap_or_default(),
+        }),
         speed: command.speed,
         amplitude: command.amplitude,
         randomization: randomization.into(),
@@ -178,9 +194,8 @@ impl Outcome {
             .collect()
     }
 
-    fn json(&self, command: &Evaluate) -> Value {
+    fn json(&self, command: &Evaluate, started: &EvaluationStarted) -> Value {
         let mut object = Map::new();
-        let started = self.started.clone().unwrap_or_default();
         object.insert("robot".to_owned(), json!(command.robot));
         object.insert("controller".to_owned(), json!(command.controller));
         object.insert("model".to_owned(), json!(started.model));
@@ -208,16 +223,16 @@ impl Outcome {
         Value::Object(object)
     }
 
-    fn print(&self, command: &Evaluate) {
+    fn print(&self, command: &Evaluate, started: &EvaluationStarted) {
         let EvaluationStarted {
+            robot,
             model,
             model_version,
             episodes,
             ..
-        } = self.started.clone().unwrap_or_default();
+        } = started;
         println!(
-            "{}, controller {}, policy {model} {model_version}, seed {}: {} of {episodes} episodes",
-            command.robot,
+            "{robot}, controller {}, policy {model} {model_version}, seed {}: {} of {episodes} episodes",
             command.controller,
             command.seed,
             self.episodes.len(),

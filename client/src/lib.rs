@@ -45,8 +45,8 @@ pub use emp_proto::v1::{
     ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig, CollectStarted, Delivery,
     DropReason, EpisodeEnd, EpisodeFinished, EpisodeMetrics, EpisodeResult, EvaluateConfig,
     EvaluationMetrics, EvaluationResult, EvaluationStarted, GoalClip, GoalStatistics, Joint,
-    KeyNode, MassRange, Metric, Model, ProceduralClips, Randomization, Robot, RolloutBlock, Spread,
-    StepEnd, TrainingEnd, evaluate_response::Message as EvaluationEvent,
+    KeyNode, MassRange, Metric, Model, ProceduralClips, Push, Randomization, Robot, RolloutBlock,
+    Spread, StepEnd, TrainingEnd, evaluate_response::Message as EvaluationEvent,
 };
 pub use error::ClientError;
 pub use rollouts::{Collection, Evaluation};

@@ -12,6 +12,7 @@ pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "
 #[allow(
     unused_qualifications,
     clippy::doc_markdown,
+    clippy::large_enum_variant,
     reason = "generated; the comments are written for gRPC users of any language"
 )]
 pub mod v1 {

@@ -11,7 +11,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
 
-/// Serves human motion retargeting over gRPC (package emp.v1, with reflection and health).
+/// Serves human motion retargeting, the policy that keeps a robot on its feet, and evaluations of it over gRPC (package
+/// emp.v1, with reflection and health).
 ///
 /// Once it accepts calls it prints one line to standard output: `listening on ADDRESS:PORT`. Logs go to standard
 /// error. SIGTERM or SIGINT let open calls finish, for at most `shutdown.grace_seconds`; a second one ends it at once.
@@ -31,8 +32,8 @@ struct Arguments {
     /// directory, that has both `robots` and `models/weights`]
     #[arg(long, value_name = "DIR")]
     robots: Option<PathBuf>,
-    /// Folder of the weights, one file `ROBOT-retargeter.safetensors` a robot [default: `models/weights` beside the
-    /// default `robots`]
+    /// Folder of the weights, files `ROBOT-retargeter.safetensors` and `ROBOT-policy.safetensors` for each robot [default:
+    /// `models/weights` beside the default `robots`]
     #[arg(long, value_name = "DIR")]
     weights: Option<PathBuf>,
     /// Form of the log [default: text]

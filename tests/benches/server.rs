@@ -1,12 +1,22 @@
-//! The server under load, client and server on one machine, over TCP: the round trip of one frame, and how many
-//! streams keep 50 Hz.
+//! The server under load, client and server on one machine, over TCP: the round trip of one frame, how many streams keep
+//! 50 Hz, and what an evaluation beside it does to a robot that is teleoperated.
 
-use std::time::Duration;
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
 
 use anyhow::Context as _;
 use criterion::Criterion;
-use emp_client::{Client, Delivery, Event, Statistics, StreamConfig, Summary};
-use emp_tests::{TestServer, poses};
+use emp_client::{
+    Client, Delivery, EvaluateConfig, EvaluationEvent, Event, PolicyConfig, ProceduralClips,
+    RobotFrame, Statistics, StreamConfig, Summary,
+};
+use emp_tests::{TestServer, emp27, policy, poses};
+use nalgebra::UnitQuaternion;
 use tokio::{runtime::Runtime, time::MissedTickBehavior};
 
 const ROBOT: &str = "emp27";
@@ -16,9 +26,12 @@ const RATE: f64 = 50.0;
 const HELD: Duration = Duration::from_secs(5);
 /// A number of streams is held when this share of answers comes before the next frame, and no more are dropped.
 const ON_TIME: f64 = 0.99;
+/// How long a robot is teleoperated, alone and beside an evaluation.
+const TELEOPERATED: Duration = Duration::from_secs(20);
 
 fn main() -> anyhow::Result<()> {
-    let server = TestServer::start_real()?;
+    let weights = policy::weights()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
@@ -35,6 +48,7 @@ fn main() -> anyhow::Result<()> {
         for refine in [false, true] {
             streams_at_rate(&runtime, &client, refine)?;
         }
+        runtime.block_on(beside_an_evaluation(&client))?;
     }
     Ok(())
 }
@@ -156,4 +170,85 @@ async fn hold(client: &Client, streams: usize, refine: bool) -> anyhow::Result<S
     (summary.frames == (frames * streams) as u64)
         .then_some(summary)
         .context("a stream ended early")
+}
+
+/// Teleoperates a robot alone, then while an evaluation takes all the time that the system has left.
+async fn beside_an_evaluation(client: &Client) -> anyhow::Result<()> {
+    report("alone", &teleoperate(client).await?);
+    let config = EvaluateConfig {
+        robot: ROBOT.to_owned(),
+        episodes: 100_000,
+        procedural: Some(ProceduralClips { count: 8, seed: 1 }),
+        ..EvaluateConfig::default()
+    };
+    let mut evaluation = client.evaluate(config, Vec::new()).await?;
+    while !matches!(
+        evaluation.next().await?.context("an evaluation")?,
+        EvaluationEvent::Started(_)
+    ) {}
+    let count = Arc::new(AtomicU64::new(0));
+    let counted = Arc::clone(&count);
+    let simulated = tokio::spawn(async move {
+        let mut frames = 0_u64;
+        while let Ok(Some(event)) = evaluation.next().await {
+            if let EvaluationEvent::Episode(episode) = event {
+                frames += episode.result.map_or(0, |result| u64::from(result.frames));
+                counted.store(frames, Ordering::Relaxed);
+            }
+        }
+    });
+    let beside = teleoperate(client).await?;
+    simulated.abort();
+    report("beside an evaluation", &beside);
+    println!(
+        "  which simulated {:.0} control periods a second meanwhile",
+        count.load(Ordering::Relaxed) as f64 / TELEOPERATED.as_secs_f64()
+    );
+    Ok(())
+}
+
+/// Round trips of a robot's control periods, in order of length: a pose becomes a goal, goal and state become leg targets.
+async fn teleoperate(client: &Client) -> anyhow::Result<Vec<Duration>> {
+    let robot = emp27()?;
+    let retarget = StreamConfig {
+        refine: true,
+        smoothing: true,
+        ..StreamConfig::for_robot(ROBOT)
+    };
+    let (mut poses_out, mut goals) = client.stream(retarget).await?;
+    let config = PolicyConfig::for_robot(ROBOT);
+    let (mut states_out, mut targets) = client.policy_stream(config).await?;
+    let frames = (TELEOPERATED.as_secs_f64() * RATE) as usize;
+    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
+    let mut times = Vec::with_capacity(frames);
+    for pose in &poses(1, frames) {
+        let tick = ticks.tick().await;
+        poses_out.send(pose, None).await?;
+        let Some(Event::Answer(goal)) = goals.next().await? else {
+            anyhow::bail!("a pose without an answer")
+        };
+        let state = RobotFrame {
+            joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
+            orientation: UnitQuaternion::identity(),
+            goal: goal.joint_angles,
+            reset: false,
+        };
+        states_out.send(&state, None).await?;
+        let Some(Event::Answer(_)) = targets.next().await? else {
+            anyhow::bail!("a state without an answer")
+        };
+        times.push(tick.elapsed());
+    }
+    times.sort_unstable();
+    Ok(times)
+}
+
+fn report(what: &str, times: &[Duration]) {
+    let at = |share: f64| 1e3 * times[((times.len() - 1) as f64 * share) as usize].as_secs_f64();
+    println!(
+        "a robot at {RATE} Hz (retarget, refined, and policy) {what}: p50 {:.2} ms, p99 {:.2} ms, longest {:.2} ms",
+        at(0.5),
+        at(0.99),
+        at(1.0),
+    );
 }

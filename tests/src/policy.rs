@@ -1,4 +1,4 @@
-//! A policy without training: small random actions that follow from the observation. Enough to tell answers apart.
+//! A policy without training: random actions that follow from the observation. Enough to tell answers apart, and to fall.
 
 use std::{path::Path, sync::Arc};
 
@@ -12,31 +12,30 @@ use emp_robot::Robot;
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 use tempfile::TempDir;
 
-/// Width of the only hidden layer.
-const HIDDEN: usize = 32;
-/// Largest weight: actions stay a fraction of the action scale.
-const LARGEST: f32 = 0.05;
+/// Widths of the hidden layers: those of the policies that ship.
+const HIDDEN: [usize; 3] = [256, 128, 64];
 
 /// Writes the weights of a random policy for `robot`.
 ///
 /// # Errors
 /// When the file cannot be written.
 pub fn write(path: &Path, robot: &Robot, seed: u64) -> anyhow::Result<()> {
-    let config = PolicyConfig::new(robot, vec![HIDDEN]);
+    let config = PolicyConfig::new(robot, HIDDEN.to_vec());
     let normalizer = Normalizer::identity(config.features());
-    let widths = [config.features(), HIDDEN, robot.leg_joints().len()];
+    let outputs = robot.leg_joints().len();
+    let widths = [&[config.features()], &HIDDEN[..], &[outputs]].concat();
     let mut rng = StdRng::seed_from_u64(seed);
-    let mut random = |shape: &[usize]| {
-        let values = (0..shape.iter().product()).map(|_| rng.random_range(-LARGEST..LARGEST));
-        Tensor::from_vec(values.collect::<Vec<f32>>(), shape, &Device::Cpu)
-    };
     let mut network = Tensors::new();
     for (layer, pair) in widths.windows(2).enumerate() {
-        let [inputs, outputs] = pair else {
-            unreachable!("pairs")
+        let [inputs, outputs] = [pair[0], pair[1]];
+        // Answers are about as large as what is asked.
+        let largest = (3.0 / inputs as f32).sqrt();
+        let mut random = |shape: &[usize]| {
+            let values = (0..shape.iter().product()).map(|_| rng.random_range(-largest..largest));
+            Tensor::from_vec(values.collect::<Vec<f32>>(), shape, &Device::Cpu)
         };
-        network.insert(format!("{layer}.weight"), random(&[*outputs, *inputs])?);
-        network.insert(format!("{layer}.bias"), random(&[*outputs])?);
+        network.insert(format!("{layer}.weight"), random(&[outputs, inputs])?);
+        network.insert(format!("{layer}.bias"), random(&[outputs])?);
     }
     let training = serde_json::json!({ "seed": seed });
     Policy::save(

@@ -1,6 +1,7 @@
 //! The project's own binaries as child processes.
 
 use std::{
+    ffi::OsStr,
     io::{BufRead as _, BufReader},
     path::{Path, PathBuf},
     process::{Child, Command, ExitStatus, Stdio},
@@ -56,8 +57,17 @@ impl ServerProcess {
     /// # Errors
     /// When it does not start.
     pub fn start(folder: &Path) -> anyhow::Result<Self> {
+        Self::start_with(folder, &[])
+    }
+
+    /// [`start`](Self::start) with further arguments.
+    ///
+    /// # Errors
+    /// When it does not start.
+    pub fn start_with(folder: &Path, arguments: &[&OsStr]) -> anyhow::Result<Self> {
         let mut child = Command::new(binaries()?.join("emp-server"))
             .args(["--listen", "127.0.0.1:0", "--log-format", "json"])
+            .args(arguments)
             .current_dir(folder)
             .stdout(Stdio::piped())
             .spawn()?;

@@ -108,8 +108,8 @@ async fn the_model_service_says_what_is_served() -> anyhow::Result<()> {
     let models = client.models().await?;
     let model = models
         .iter()
-        .find(|model| model.robot == "emp27")
-        .expect("a model for emp27");
+        .find(|model| model.name == "emp27-retargeter")
+        .expect("emp27's retargeter");
     assert_eq!(*model, client.model(&model.name).await?);
     assert_eq!(model.weights_sha256.len(), 64);
     let served = client.robot("emp27").await?;

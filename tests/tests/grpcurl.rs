@@ -2,7 +2,7 @@
 
 use std::process::{Command, Output, Stdio};
 
-use emp_tests::TestServer;
+use emp_tests::{TestServer, emp27, policy};
 use serde_json::{Value, json};
 
 fn grpcurl_is_here() -> bool {
@@ -51,11 +51,13 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
     if !grpcurl_is_here() {
         return Ok(());
     }
-    let server = TestServer::start_real()?;
+    let weights = policy::weights()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
     let services = stdout(&grpcurl(&server, None, &["list"])?)?;
     for service in [
         "emp.v1.ModelService",
         "emp.v1.MotionService",
+        "emp.v1.RolloutService",
         "grpc.health.v1.Health",
     ] {
         assert!(services.contains(service), "{services}");
@@ -66,12 +68,28 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
         "comments reach grpcurl: {pose_description}"
     );
 
-    let health = stdout(&grpcurl(
-        &server,
-        Some(r#"{"service": "emp.v1.MotionService"}"#),
-        &["grpc.health.v1.Health/Check"],
-    )?)?;
-    assert_eq!(serde_json::from_str::<Value>(&health)?["status"], "SERVING");
+    for (message, comment) in [
+        ("emp.v1.RobotState", "Angle of every joint; radians, finite"),
+        (
+            "emp.v1.PolicyFrame",
+            "Whether this frame starts a new episode",
+        ),
+        ("emp.v1.EvaluateConfig", "no unit, 0.1 to 10. Left out: 1"),
+        (
+            "emp.v1.RolloutBlock",
+            "The policy's mean actions, `CollectStarted.actions` numbers a row",
+        ),
+    ] {
+        let description = stdout(&grpcurl(&server, None, &["describe", message])?)?;
+        assert!(description.contains(comment), "{description}");
+    }
+
+    for service in ["emp.v1.MotionService", "emp.v1.RolloutService"] {
+        let request = json!({"service": service}).to_string();
+        let call = ["grpc.health.v1.Health/Check"];
+        let health = stdout(&grpcurl(&server, Some(&request), &call)?)?;
+        assert_eq!(serde_json::from_str::<Value>(&health)?["status"], "SERVING");
+    }
 
     let models = stdout(&grpcurl(
         &server,
@@ -79,7 +97,8 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
         &["emp.v1.ModelService/ListModels"],
     )?)?;
     let models: Value = serde_json::from_str(&models)?;
-    assert_eq!(models["models"][0]["kind"], "MODEL_KIND_RETARGETER");
+    assert_eq!(models["models"][0]["kind"], "MODEL_KIND_POLICY");
+    assert_eq!(models["models"][1]["kind"], "MODEL_KIND_RETARGETER");
     let name = json!({"name": models["models"][0]["name"]}).to_string();
     stdout(&grpcurl(
         &server,
@@ -137,5 +156,69 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
     for part in ["InvalidArgument", "NOT_SERVED", "google.rpc.BadRequest"] {
         assert!(explanation.contains(part), "{explanation}");
     }
+    Ok(())
+}
+
+/// The robot at rest in its default pose, as a message.
+fn state() -> anyhow::Result<(Value, Value)> {
+    let robot = emp27()?;
+    let joints: Vec<f64> = robot.joints().map(|joint| joint.default).collect();
+    let goal = joints[..robot.goal_joints().len()].to_vec();
+    let state = json!({"joint_positions": joints, "base_orientation": {"w": 1}});
+    Ok((state, json!(goal)))
+}
+
+fn messages(text: &str) -> anyhow::Result<Vec<Value>> {
+    let messages = serde_json::Deserializer::from_str(text).into_iter();
+    Ok(messages.collect::<Result<_, _>>()?)
+}
+
+#[test]
+fn grpcurl_steps_a_policy_and_evaluates() -> anyhow::Result<()> {
+    if !grpcurl_is_here() {
+        return Ok(());
+    }
+    let weights = policy::weights()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let (state, goal) = state()?;
+    let observation = json!({"state": state, "goal": goal});
+    let request = json!({"robot": "emp27", "history": [observation]}).to_string();
+    let call = ["emp.v1.MotionService/StepPolicy"];
+    let answer = stdout(&grpcurl(&server, Some(&request), &call)?)?;
+    let answer: Value = serde_json::from_str(&answer)?;
+    let result = &answer["result"];
+    let length = |field: &str| result[field].as_array().map(Vec::len);
+    assert_eq!(length("legTargets"), Some(12));
+    assert_eq!(length("executableGoal"), Some(15));
+
+    let frame = json!({"frame": {"state": state, "goal": goal}});
+    let requests = [json!({"config": {"robot": "emp27"}}), frame.clone(), frame]
+        .map(|message| message.to_string())
+        .join("\n");
+    let call = ["emp.v1.MotionService/StreamPolicy"];
+    let answers = messages(&stdout(&grpcurl(&server, Some(&requests), &call)?)?)?;
+    assert_eq!(answers.len(), 3);
+    assert_eq!(answers[0]["started"]["history"], 15);
+    assert_eq!(
+        answers[1]["result"]["result"]["action"], result["action"],
+        "a stream's first frame is a history of one"
+    );
+
+    // No motion file is needed.
+    let request = json!({"config": {"robot": "emp27", "episodes": 3, "procedural": {"count": 1}}});
+    let call = ["emp.v1.RolloutService/Evaluate"];
+    let answers = messages(&stdout(&grpcurl(
+        &server,
+        Some(&request.to_string()),
+        &call,
+    )?)?)?;
+    let episodes = answers
+        .iter()
+        .filter(|answer| answer["episode"].is_object());
+    assert_eq!(episodes.count(), 3);
+    let result = &answers.last().expect("messages")["result"];
+    assert_eq!(result["all"]["episodes"], 3);
+    assert!(result["all"]["mbo"]["mean"].is_f64());
+    assert!(result["recorded"].is_null());
     Ok(())
 }

@@ -1,11 +1,15 @@
 //! The shipped binaries: `emp-server` from any folder, its end by SIGTERM, and `emp` against it.
 
-use std::process::{Command, Output};
+use std::{
+    ffi::OsStr,
+    path::Path,
+    process::{Command, Output},
+};
 
 use emp_client::{Backoff, Client, ClientError, Event, StreamConfig};
 use emp_motion::{key_nodes, skills};
 use emp_tests::{
-    poses,
+    policy, poses,
     process::{ServerProcess, binaries},
     root, within,
 };
@@ -98,6 +102,155 @@ fn the_command_retargets_a_file() -> anyhow::Result<()> {
         assert_eq!(Some(lines.count() as u64), summary["answered"].as_u64());
     }
     Ok(())
+}
+
+fn evaluation_server(weights: &Path) -> anyhow::Result<(tempfile::TempDir, ServerProcess)> {
+    let folder = tempfile::tempdir()?;
+    let arguments = [OsStr::new("--weights"), weights.as_os_str()];
+    let server = ServerProcess::start_with(folder.path(), &arguments)?;
+    Ok((folder, server))
+}
+
+#[test]
+fn the_command_evaluates_a_controller() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let (folder, server) = evaluation_server(weights.path())?;
+    let motions = folder.path().join("motions");
+    std::fs::create_dir(&motions)?;
+    let clip = skills::generate(skills::Skill::Wave, 1).resampled(50.0);
+    key_nodes::write(&motions.join("wave.npz"), &clip)?;
+    let table = folder.path().join("episodes.csv");
+    let [motions, table] = [motions, table].map(|path| path.to_string_lossy().into_owned());
+    let arguments = [
+        "evaluate",
+        "--robot",
+        "emp27",
+        "--controller",
+        "amplitude-cut:factor=0.8",
+        "--motions",
+        &motions,
+        "--procedural",
+        "1",
+        "--seed",
+        "4",
+        "--load",
+        "0.5..0.6",
+        "--csv",
+        &table,
+    ];
+    let json = emp(&server.url, &[&arguments[..], &["--json"]].concat())?;
+    assert!(json.status.success(), "{}", text(&json.stderr));
+    let object: Value = serde_json::from_slice(&json.stdout)?;
+    assert_eq!(object["robot"], "emp27");
+    assert_eq!(object["controller"], "amplitude-cut:factor=0.8");
+    assert_eq!(object["seed"], 4);
+    assert_eq!(object["complete"], true);
+    for metric in ["suc", "mjp", "msc", "mbv", "mba", "mbo", "mus"] {
+        for part in ["low", "mean", "high"] {
+            assert!(object[metric][part].is_f64(), "{metric}.{part}: {object}");
+        }
+    }
+    let episodes = object["episodes"].as_u64().expect("a number");
+    let of = |set: &str| object[set]["episodes"].as_u64().expect("a number");
+    assert_eq!(of("recorded") + of("procedural"), episodes);
+    let failures = object["failures"].as_array().expect("failures");
+    assert!(!failures.is_empty(), "a random policy falls");
+    assert!(failures[0]["time"].as_f64().is_some_and(|time| time > 0.0));
+    let rows = std::fs::read_to_string(&table)?;
+    assert_eq!(rows.lines().count() as u64, 1 + episodes);
+
+    let again = emp(&server.url, &[&arguments[..], &["--json"]].concat())?;
+    assert_eq!(again.stdout, json.stdout, "the same request, the same bits");
+    let printed = emp(&server.url, &arguments)?;
+    let printed = text(&printed.stdout);
+    for part in ["SUC", "procedural (", "goals: faster hand", "failed: "] {
+        assert!(printed.contains(part), "{printed}");
+    }
+
+    let unknown = emp(
+        &server.url,
+        &[
+            "evaluate",
+            "--robot",
+            "emp27",
+            "--procedural",
+            "1",
+            "--controller",
+            "wishful-thinking",
+        ],
+    )?;
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(
+        text(&unknown.stderr).contains("velocity-limit"),
+        "it says what there is: {}",
+        text(&unknown.stderr)
+    );
+    Ok(())
+}
+
+/// Starts an evaluation without end, lets some episodes finish, stops it by `stop`, and gives what was printed.
+fn stopped_evaluation(
+    server: &mut ServerProcess,
+    table: &Path,
+    stop: impl FnOnce(u32, &mut ServerProcess) -> anyhow::Result<()>,
+) -> anyhow::Result<Output> {
+    let child = Command::new(binaries()?.join("emp"))
+        .args(["--server", &server.url, "evaluate", "--robot", "emp27"])
+        .args(["--procedural", "1", "--episodes", "100000", "--json"])
+        .arg("--csv")
+        .arg(table)
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()?;
+    std::thread::sleep(std::time::Duration::from_secs(4));
+    stop(child.id(), server)?;
+    Ok(child.wait_with_output()?)
+}
+
+fn assert_partial(output: &Output, table: &Path) -> anyhow::Result<()> {
+    let object: Value = serde_json::from_slice(&output.stdout)?;
+    assert_eq!(object["complete"], false);
+    let episodes = object["episodes"].as_u64().expect("a number");
+    assert!(episodes > 0);
+    assert!(object["mbo"]["mean"].is_f64());
+    let rows = std::fs::read_to_string(table)?;
+    assert_eq!(rows.lines().count() as u64, 1 + episodes);
+    Ok(())
+}
+
+#[test]
+fn an_interrupted_evaluation_reports_what_finished() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let (folder, mut server) = evaluation_server(weights.path())?;
+    let table = folder.path().join("episodes.csv");
+    let output = stopped_evaluation(&mut server, &table, |client, _| {
+        Command::new("kill")
+            .args(["-INT", &client.to_string()])
+            .status()?;
+        Ok(())
+    })?;
+    assert_eq!(output.status.code(), Some(130), "{}", text(&output.stderr));
+    assert_partial(&output, &table)
+}
+
+#[test]
+fn sigterm_drains_a_server_with_an_evaluation_running() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let (folder, mut server) = evaluation_server(weights.path())?;
+    let table = folder.path().join("episodes.csv");
+    let output = stopped_evaluation(&mut server, &table, |_, server| {
+        server.terminate()?;
+        let status = server.wait()?;
+        assert!(status.success(), "{status}");
+        Ok(())
+    })?;
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        text(&output.stderr).contains("shutting down"),
+        "{}",
+        text(&output.stderr)
+    );
+    assert_partial(&output, &table)
 }
 
 #[test]

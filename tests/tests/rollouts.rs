@@ -5,7 +5,7 @@ use std::{sync::Arc, time::Duration};
 use emp_client::{
     Client, ClientError, CollectFinished, CollectRequest, CollectRolloutsConfig, Collection,
     EvaluateConfig, Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult,
-    GoalClip as SentClip, MassRange, Metric, ProceduralClips, RolloutBlock, StepEnd,
+    GoalClip as SentClip, MassRange, Metric, ProceduralClips, Push, RolloutBlock, StepEnd,
 };
 use emp_models::{controller::Controller, policy::Policy, retarget::Retargeter};
 use emp_motion::{Clip, skills};
@@ -167,7 +167,10 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
         controller: "velocity-limit:limit=3".to_owned(),
         procedural: procedural(2),
         amplitude: Some(1.2),
-        push: Some(0.4),
+        push: Some(Push {
+            speed: 0.4,
+            interval: 0.0,
+        }),
         ..config()
     };
     let mut results = Vec::new();
@@ -301,7 +304,24 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
                 });
             }),
         ),
-        ("config.push", with(&|config| config.push = Some(f64::NAN))),
+        (
+            "config.push.speed",
+            with(&|config| {
+                config.push = Some(Push {
+                    speed: f64::NAN,
+                    interval: 1.0,
+                });
+            }),
+        ),
+        (
+            "config.push.interval",
+            with(&|config| {
+                config.push = Some(Push {
+                    speed: 1.0,
+                    interval: -1.0,
+                });
+            }),
+        ),
         ("config.speed", with(&|config| config.speed = Some(0.0))),
         (
             "config.amplitude",

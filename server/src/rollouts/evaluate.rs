@@ -6,12 +6,12 @@ use emp_models::{controller::Controller, filters, retarget::Retargeter};
 use emp_motion::Clip;
 use emp_proto::v1::{
     EpisodeFinished, EvaluateConfig, EvaluateRequest, EvaluateResponse, EvaluationPreparing,
-    EvaluationStarted, HumanPose, MotionClip, Randomization, evaluate_request::Message as Request,
-    evaluate_response::Message as Response,
+    EvaluationStarted, HumanPose, MotionClip, Push, Randomization,
+    evaluate_request::Message as Request, evaluate_response::Message as Response,
 };
 use emp_robot::Robot;
 use emp_sim::{
-    SimError, environment,
+    SimError,
     evaluation::{Conditions, EpisodeResult, EvaluationSettings, Kick, Progress, evaluate},
     goals::{GoalClip, Source},
 };
@@ -32,6 +32,8 @@ use crate::{
 
 /// Frames of an evaluation clip, as in the paper.
 const CLIP_FRAMES: usize = 200;
+/// Time between pushes, as in the paper, seconds.
+const PUSH_INTERVAL: f64 = 5.0;
 /// Most frames of an evaluation clip, and most episodes.
 const MAX_COUNT: u32 = 100_000;
 /// Most frames a second of a motion.
@@ -241,17 +243,13 @@ fn read_settings(config: &EvaluateConfig, robot: &Robot) -> Result<EvaluationSet
         }
         None => None,
     };
-    let interval = environment::Randomization::default()
-        .push
-        .map(|push| push.interval);
-    let push = config.push.zip(interval);
     let episodes = read::within("config.episodes", config.episodes, 0..=MAX_COUNT)?;
     let settings = EvaluationSettings {
         seed: config.seed,
         episodes: (episodes > 0).then_some(episodes as usize),
         conditions,
         hand_load,
-        push: push.map(|(speed, interval)| Kick { speed, interval }),
+        push: config.push.as_ref().map(kick),
         speed: config.speed.unwrap_or(1.0),
         amplitude: config.amplitude.unwrap_or(1.0),
     };
@@ -260,16 +258,24 @@ fn read_settings(config: &EvaluateConfig, robot: &Robot) -> Result<EvaluationSet
             name,
             expected,
             found,
-        } => {
-            let field = name.strip_suffix(".speed").unwrap_or(&name);
-            FieldError::new(
-                format!("config.{field}"),
-                format!("{found}; expected {expected}"),
-            )
-        }
+        } => FieldError::new(
+            format!("config.{name}"),
+            format!("{found}; expected {expected}"),
+        ),
         error => FieldError::new("config", error.to_string()),
     })?;
     Ok(settings)
+}
+
+fn kick(push: &Push) -> Kick {
+    Kick {
+        speed: push.speed,
+        interval: if push.interval == 0.0 {
+            PUSH_INTERVAL
+        } else {
+            push.interval
+        },
+    }
 }
 
 fn read_controller(name: &str, policy: &PolicyModel) -> Result<Controller, FieldError> {

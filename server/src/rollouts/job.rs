@@ -158,12 +158,12 @@ impl<T: Send + 'static> Line<T> {
             let worked = catch_unwind(AssertUnwindSafe(|| work(&self, place.threads)));
             let end = worked.unwrap_or_else(|panic| Err(panicked(panic)));
             let seconds = started.elapsed().as_secs_f64();
+            // The place is free before the client hears of the end and asks for the next.
+            drop(place);
             match end {
                 Ok(()) => tracing::info!(seconds, "job done"),
                 Err(error) => {
                     tracing::info!(seconds, %error, "job ended early");
-                    // The place is free before the client hears of it and asks for the next.
-                    drop(place);
                     let _ = self.sender.blocking_send(Err(error.into()));
                 }
             }

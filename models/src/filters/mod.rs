@@ -73,7 +73,7 @@ pub const LIST: [FilterDescription; 7] = [
     },
     FilterDescription {
         name: StaticClamp::NAME,
-        parameters: "margin=0.05,legs=default",
+        parameters: "margin=<0.7 of the default pose's>,legs=default",
         summary: "goals are pulled to the default pose until the centre of mass is margin (m) inside the feet's support; legs default or measured",
     },
 ];

@@ -8,13 +8,15 @@ use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use super::{FilterError, Parameters, Rule};
 use crate::{controller::FilterItem, observation::ObservationLayout};
 
+/// The margin without a parameter, as a share of the default pose's own.
+const USUAL_SHARE: f64 = 0.7;
 /// Halvings of the way to the default pose: to a thousandth of it.
 const BISECTIONS: usize = 10;
 
 /// Pulls a goal back along the line to the default pose until the centre of mass, projected on the floor, is far enough
 /// inside the feet's support.
 ///
-/// Parameters: `margin`, metres from the support polygon's nearest edge; `legs`, `default` (the robot upright, its legs in
+/// Parameters: `margin`, metres from the support polygon's nearest edge (without it 0.7 of the default pose's own); `legs`, `default` (the robot upright, its legs in
 /// the default pose) or `measured` (legs, roll and pitch as in the observation's newest frame). Masses are the robot's own;
 /// what the hands carry is unknown. Where even the default pose lacks the margin, that pose is the answer.
 pub(super) struct StaticClamp {
@@ -37,15 +39,16 @@ impl StaticClamp {
         let margin = parameters.number("margin", 0.0..=1.0, " m")?;
         let legs = parameters.word("legs", &["default", "measured"])?;
         parameters.finish("margin or legs")?;
-        let clamp = Self {
+        let mut clamp = Self {
             layout: ObservationLayout::new(robot, 1),
             polygon: robot.support_polygon(),
-            margin: margin.unwrap_or(0.05),
+            margin: 0.0,
             measured: legs == Some("measured"),
             default: robot.joints().map(|joint| joint.default as f32).collect(),
             robot: Arc::clone(robot),
         };
         let most = clamp.margin(&clamp.default, &UnitQuaternion::identity());
+        clamp.margin = margin.unwrap_or(USUAL_SHARE * most);
         if clamp.margin > most {
             let expected = format!("at most the default pose's own, {most:.4} m");
             return Err(parameters.value("margin", expected, clamp.margin.to_string()));

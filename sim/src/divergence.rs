@@ -50,8 +50,7 @@ impl Divergence {
 
     /// Whether a state that no further step will look at is still one.
     pub(crate) fn of_state(data: &MjData<Box<MjModel>>) -> Option<Self> {
-        // Not `abs() > HUGE`: that is false of NaN.
-        let is_bad = |value: &f64| !(value.abs() <= HUGE);
+        let is_bad = |value: &f64| value.is_nan() || value.abs() > HUGE;
         if data.qpos().iter().any(is_bad) {
             Some(Self::Position)
         } else if data.qvel().iter().any(is_bad) {

@@ -83,3 +83,44 @@ impl Pool {
         stage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::emp27;
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn low_priority_threads_stand_behind_the_others() {
+        let robot = emp27();
+        let niceness = |priority: Priority| {
+            let pool = Pool::new(&robot, 2, priority).unwrap();
+            let mut found = [0_i64; 8];
+            pool.for_each(found.par_iter_mut(), |_, found| {
+                let statistics = std::fs::read_to_string("/proc/thread-self/stat").unwrap();
+                // Field 19, counted from the one after the thread's name in brackets, which is field 2.
+                let mut fields = statistics.rsplit(')').next().unwrap().split_whitespace();
+                *found = fields.nth(16).unwrap().parse().unwrap();
+            });
+            found
+        };
+        let own = niceness(Priority::Normal);
+        assert_eq!(niceness(Priority::Low), [19; 8]);
+        assert!(own.iter().all(|&nice| nice < 19), "{own:?}");
+    }
+
+    #[test]
+    fn every_item_is_worked_on_once_and_a_panic_stops_no_later_work() {
+        let robot = emp27();
+        let pool = Pool::new(&robot, 3, Priority::Normal).unwrap();
+        let mut items = [0; 100];
+        let failed = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            pool.for_each(items.par_iter_mut().enumerate(), |_, (index, _)| {
+                assert_ne!(index, 50, "this test's panic");
+            });
+        }));
+        assert!(failed.is_err());
+        pool.for_each(items.par_iter_mut(), |_, item| *item += 1);
+        assert_eq!(items, [1; 100]);
+    }
+}

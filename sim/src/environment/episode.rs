@@ -123,7 +123,7 @@ pub(super) struct Environment {
     body: Body,
     history: History,
     goals: GoalStream,
-    /// The present goal g_t.
+    /// The present goal `g_t`.
     goal: Vec<f32>,
     /// Goals ahead of it.
     ahead: [Vec<f32>; 2],

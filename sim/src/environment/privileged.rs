@@ -27,7 +27,7 @@ pub(super) const AHEAD: [usize; 2] = [1, 5];
 /// the factor that its comment gives.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PrivilegedLayout {
-    /// The newest frame s_t, as in the observation.
+    /// The newest frame `s_t`, as in the observation.
     pub frame: Range<usize>,
     /// Velocity of the base in its heading frame (x forward, z up), m/s.
     pub linear_velocity: Range<usize>,
@@ -43,7 +43,7 @@ pub struct PrivilegedLayout {
     pub foot_forces: Range<usize>,
     /// Horizontal way from the middle between the feet to the centre of mass, heading frame, m × 10.
     pub center_of_mass: Range<usize>,
-    /// The action before the last, a_{t−2}, policy units; a_{t−1} is in the frame.
+    /// The action before the last, `a_{t−2}`, policy units; `a_{t−1}` is in the frame.
     pub action_before: Range<usize>,
     /// Change of the goal from now to 1 control period ahead, rad × 10.
     pub goal_next: Range<usize>,

@@ -52,35 +52,35 @@ macro_rules! rewards {
 }
 
 rewards! {
-    /// exp(−10 ‖(roll, pitch)‖₁)
+    /// `exp(−10 ‖(roll, pitch)‖₁)`
     base_orientation = 3.0,
-    /// exp(−20 ‖pg_xy‖₂), pg the projected gravity
+    /// `exp(−20 ‖pg_xy‖₂)`, pg the projected gravity
     projected_gravity = 3.0,
-    /// exp(−100 |h − h_ref|), h_ref the standing height
+    /// `exp(−100 |h − h_ref|)`, `h_ref` the standing height
     base_height = 0.2,
-    /// exp(−10 ‖v‖₂²)
+    /// `exp(−10 ‖v‖₂²)`
     base_linear_velocity = 0.75,
-    /// exp(−20 ‖ω‖₂)
+    /// `exp(−20 ‖ω‖₂)`
     base_angular_velocity = 0.75,
-    /// exp(−3 ‖v_t − v_{t−1}‖₂)
+    /// `exp(−3 ‖v_t − v_{t−1}‖₂)`
     base_acceleration = 0.2,
-    /// exp(−100 ‖q_leg − q_leg,ref‖₂), q_leg,ref the default pose
+    /// `exp(−100 ‖q_leg − q_ref‖₂)`, `q_ref` the default pose
     leg_position = 1.0,
-    /// 1(F_z ≥ 5 N), mean over the feet
+    /// `1(F_z ≥ 5 N)`, mean over the feet
     feet_contact = 0.5,
-    /// 1(F_z ≥ 5 N) √‖v_foot‖₂, sum over the feet; negative (erratum E2)
+    /// `1(F_z ≥ 5 N) √‖v_foot‖₂`, sum over the feet; negative (erratum E2)
     feet_slip = -0.2,
-    /// ‖a_t‖₁, a in radians of leg target
+    /// `‖a_t‖₁`, a in radians of leg target
     action_range = -0.075,
-    /// ‖a_t − a_{t−1}‖₂²
+    /// `‖a_t − a_{t−1}‖₂²`
     action_rate = -1.5,
-    /// ‖a_t − 2 a_{t−1} + a_{t−2}‖₂²
+    /// `‖a_t − 2 a_{t−1} + a_{t−2}‖₂²`
     action_acceleration = -1.5,
-    /// ‖τ‖₂² of the legs
+    /// `‖τ‖₂²` of the legs
     torques = -1e-5,
-    /// ‖q̇‖₂² of the legs
+    /// `‖q̇‖₂²` of the legs
     joint_velocity = -1e-4,
-    /// ‖q̈‖₂² of the legs
+    /// `‖q̈‖₂²` of the legs
     joint_acceleration = -1e-7,
 }
 
@@ -94,7 +94,7 @@ pub(super) struct Outcome<'a> {
     pub(super) leg_default: &'a [f32],
     /// Radians of one unit of action.
     pub(super) action_scale: f64,
-    /// The last actions, newest first: a_t, a_{t−1}, a_{t−2}, policy units.
+    /// The last actions, newest first: `a_t`, `a_{t−1}`, `a_{t−2}`, policy units.
     pub(super) actions: [&'a [f32]; 3],
 }
 

@@ -117,7 +117,7 @@ impl VecEnvironment {
         &self.setting.privileged
     }
 
-    /// The stacks S_t, N × [`ObservationLayout::width`].
+    /// The stacks `S_t`, N × [`ObservationLayout::width`].
     pub fn observations(&self) -> &[f32] {
         &self.batch.observations
     }

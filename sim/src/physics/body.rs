@@ -69,7 +69,7 @@ pub struct Reading {
     pub linear_velocity: Vector3<f64>,
     /// Angular velocity of the base in its own frame, rad/s.
     pub angular_velocity: Vector3<f64>,
-    /// Change of the base's velocity over the control period, v_t − v_{t−1} of the paper, m/s. A push before it does not count.
+    /// Change of the base's velocity over the control period, `v_t − v_{t−1}` of the paper, m/s. A push before it does not count.
     pub velocity_change: Vector3<f64>,
     /// Centre of mass of the whole robot in the world, metres.
     pub center_of_mass: Vector3<f64>,

@@ -14,8 +14,9 @@ use emp_training::{
     policy::{
         self, Run,
         judge::Judge,
+        remote::RemoteSource,
         settings::{PpoSettings, Symmetry},
-        source::LocalSource,
+        source::{LocalSource, RolloutSource},
     },
     retargeter::{
         data::{self, Dataset},
@@ -49,6 +50,8 @@ enum Command {
     /// Procedural skills are always in the mix; recorded motion comes from --motions, retargeted by the robot's retargeter.
     /// The run's checkpoint and CSV log stand in runs/policy-ROBOT; Ctrl-C saves, --resume continues bit for bit.
     Policy(PolicyArguments),
+    /// Draw the learning curves of policies.
+    PolicyCurves(CurvesArguments),
     /// Compare a trained retargeter with converged inverse kinematics on the same objective.
     RetargetReport(ReportArguments),
 }
@@ -142,6 +145,9 @@ struct PolicyArguments {
     /// How left–right symmetry is used.
     #[arg(long, value_enum, default_value_t = Symmetry::None)]
     symmetry: Symmetry,
+    /// Servers that simulate, for example http://host:50051; without any, this machine does. A resumed run needs as many.
+    #[arg(long, num_args = 1.., value_name = "URL")]
+    remote: Vec<String>,
     /// Continue the run from its checkpoint.
     #[arg(long)]
     resume: bool,
@@ -154,6 +160,16 @@ struct PolicyArguments {
     /// Threads for physics and learning; the weights do not depend on it.
     #[arg(long, default_value_t = 2)]
     threads: usize,
+}
+
+#[derive(Args)]
+struct CurvesArguments {
+    /// Logs of runs: log.csv in a run's folder. Evaluations beside it are drawn too.
+    #[arg(long, num_args = 1.., required = true, value_name = "CSV")]
+    log: Vec<PathBuf>,
+    /// Where the picture goes, SVG.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
 }
 
 #[derive(Args)]
@@ -180,6 +196,10 @@ fn main() -> Result<ExitCode> {
     match Cli::parse().command {
         Command::Retargeter(arguments) => train_retargeter(&arguments),
         Command::Policy(arguments) => train_policy(&arguments),
+        Command::PolicyCurves(arguments) => {
+            policy::curves::draw(&arguments.log, &arguments.out)?;
+            Ok(ExitCode::SUCCESS)
+        }
         Command::RetargetReport(arguments) => report_retargeter(&arguments),
     }
 }
@@ -295,15 +315,31 @@ fn train_policy(arguments: &PolicyArguments) -> Result<ExitCode> {
         Arc::clone(&pool),
         arguments.threads,
     )?;
-    let mut source = LocalSource::new(&robot, &pool, &settings, Arc::new(library))?;
+    let mut source: Box<dyn RolloutSource> = if arguments.remote.is_empty() {
+        let library = Arc::new(library);
+        Box::new(LocalSource::new(&robot, &pool, &settings, library)?)
+    } else {
+        Box::new(RemoteSource::new(
+            &arguments.remote,
+            &robot,
+            &settings,
+            &library,
+        )?)
+    };
     let mut trainer = if arguments.resume {
-        policy::Trainer::resume(robot, settings, arguments.threads, &checkpoint, &mut source)?
+        policy::Trainer::resume(
+            robot,
+            settings,
+            arguments.threads,
+            &checkpoint,
+            source.as_mut(),
+        )?
     } else {
         policy::Trainer::new(robot, settings, arguments.threads)?
     };
     let interrupt = Interrupt::listen()?;
     let mut run = Run {
-        source: &mut source,
+        source: source.as_mut(),
         judge: &judge,
         data,
         files,

@@ -1,12 +1,14 @@
 //! The lower-body policy: proximal policy optimisation with an asymmetric actor–critic (paper, section IV).
 
 pub mod curriculum;
+pub mod curves;
 pub mod data;
 pub mod judge;
 pub mod learner;
 pub mod moments;
 pub mod network;
 pub mod objective;
+pub mod remote;
 pub mod returns;
 pub mod settings;
 pub mod source;

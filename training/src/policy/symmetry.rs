@@ -70,3 +70,62 @@ impl FeatureMirror {
         mirrored
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emp_models::observation::{HISTORY, History, RobotState};
+    use nalgebra::UnitQuaternion;
+
+    /// Features of a robot that was pushed around, or of its mirror image.
+    fn features(robot: &Robot, config: &PolicyConfig, mirrored: bool) -> Vec<f32> {
+        let mirror = robot.mirror().unwrap();
+        let mut history = History::new(config.observation);
+        let (all, goals) = (robot.joints().count(), robot.goal_joints().len());
+        for t in 0..HISTORY + 3 {
+            let wave = |i: usize, count: usize| ((t * count + i) as f32 * 0.7).sin();
+            let numbers = |count: usize| (0..count).map(|i| wave(i, count)).collect::<Vec<f32>>();
+            let (mut joints, mut goal) = (numbers(all), numbers(goals));
+            let mut action = numbers(all - goals);
+            let [roll, pitch, yaw] = [0.1, 0.2, 0.3].map(|x| x * f64::from(wave(1, 3)));
+            let mut angles = [roll, pitch, yaw];
+            if mirrored {
+                let before = (joints.clone(), goal.clone(), action.clone());
+                mirror.joints(&before.0, &mut joints);
+                mirror.goal(&before.1, &mut goal);
+                mirror.legs(&before.2, &mut action);
+                angles = [-roll, pitch, -yaw];
+            }
+            let [roll, pitch, yaw] = angles;
+            let state = RobotState {
+                joint_positions: &joints,
+                orientation: UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+            };
+            history.push(&state, &goal);
+            history.set_last_action(&action);
+        }
+        let mut features = Vec::new();
+        config.map_history(history.stack(), &mut features);
+        features
+    }
+
+    #[test]
+    fn mirrored_features_are_those_of_the_mirrored_robot_and_twice_is_none() {
+        let robot = Robot::load("../robots/emp27".as_ref()).unwrap();
+        let config = PolicyConfig::new(&robot, vec![8]);
+        let mirror = FeatureMirror::new(&robot, &config).unwrap();
+        let (seen, expected) = (
+            features(&robot, &config, false),
+            features(&robot, &config, true),
+        );
+        let mirrored = mirror.features(&seen);
+        for (a, b) in mirrored.iter().zip(&expected) {
+            assert!((a - b).abs() < 1e-5, "{a} {b}");
+        }
+        assert_ne!(mirrored, seen);
+        assert_eq!(mirror.features(&mirrored), seen);
+        let actions: Vec<f32> = (0..24).map(|i| i as f32).collect();
+        assert_ne!(mirror.actions(&actions), actions);
+        assert_eq!(mirror.actions(&mirror.actions(&actions)), actions);
+    }
+}

@@ -383,7 +383,7 @@ struct Step {
 }
 
 /// The names of the log's columns.
-fn columns() -> Vec<&'static str> {
+pub(super) fn columns() -> Vec<&'static str> {
     let mut columns = vec!["step"];
     columns.extend(EPISODE_COLUMNS);
     columns.push("reward");

@@ -53,7 +53,6 @@ struct Plan {
     clips: Vec<GoalClip>,
     /// The retargeter, number and seed of the procedural motions, if there are any.
     procedural: Option<(Arc<Retargeter>, (usize, u64))>,
-    place: Place,
 }
 
 /// Serves one call to its end.
@@ -62,54 +61,52 @@ pub(super) async fn run(
     mut inbound: Streaming<CollectRolloutsRequest>,
     line: CollectLine,
 ) {
-    let Some(plan) = line.prepare(read_plan(&context, &mut inbound)).await else {
+    let prepared = line.prepare(read_plan(&context, &mut inbound)).await;
+    let Some((plan, place)) = prepared else {
         return;
     };
-    let Plan {
-        robot,
-        environments,
-        seed,
-        config,
-        clips,
-        procedural,
-        place,
-    } = plan;
     let (forward, requests) = mpsc::channel(INBOUND);
     line.clone().start(place, move |line, threads| {
-        let mut library = clips;
-        if let Some((retargeter, which)) = procedural {
+        plan.learner(line, threads)?.serve(requests)
+    });
+    forward_requests(&line, inbound, forward).await;
+}
+
+impl Plan {
+    /// Makes the library and places the robots, on the job's thread.
+    fn learner(self, line: &CollectLine, threads: usize) -> Result<Learner<'_>, ServiceError> {
+        let mut library = self.clips;
+        if let Some((retargeter, which)) = self.procedural {
             let motions = motion::procedural(which);
+            let stop = |_| line.check();
             let source = Source::Procedural;
             library.extend(motion::retarget(
                 &retargeter,
                 &motions,
                 source,
                 threads,
-                |_| line.check(),
+                stop,
             )?);
         }
-        let library = Arc::new(GoalLibrary::new(&robot, library).map_err(failed)?);
-        let pool = job::pool(&robot, threads).map_err(failed)?;
-        let first = environments.start;
+        let library = GoalLibrary::new(&self.robot, library).map_err(failed)?;
+        let pool = job::pool(&self.robot, threads).map_err(failed)?;
+        let first = self.environments.start;
         let environments = VecEnvironment::new(
-            Arc::clone(&robot),
+            Arc::clone(&self.robot),
             pool,
-            config,
-            library,
-            environments,
-            seed,
+            self.config,
+            Arc::new(library),
+            self.environments,
+            self.seed,
         )
         .map_err(failed)?;
-        let collector = Collector::new(environments, first, seed);
-        Learner {
+        Ok(Learner {
             line,
-            robot,
-            collector,
+            robot: self.robot,
+            collector: Collector::new(environments, first, self.seed),
             restoring: Vec::new(),
-        }
-        .serve(requests)
-    });
-    forward_requests(&line, inbound, forward).await;
+        })
+    }
 }
 
 /// Hands requests to the job until the client half-closes or the job has to stop; letting go of `forward` wakes the job.
@@ -141,7 +138,7 @@ async fn forward_requests(
 async fn read_plan(
     context: &RolloutContext,
     inbound: &mut Streaming<CollectRolloutsRequest>,
-) -> Result<Plan, ServiceError> {
+) -> Result<(Plan, Place), ServiceError> {
     let config = match read::message(inbound)
         .await?
         .and_then(|first| first.message)
@@ -177,15 +174,15 @@ async fn read_plan(
         }
     };
     let place = context.jobs.enter()?;
-    Ok(Plan {
+    let plan = Plan {
         clips: read_clips(context, inbound, &robot, number).await?,
         robot,
         environments: first..end,
         seed: config.seed,
         config: environment,
         procedural,
-        place,
-    })
+    };
+    Ok((plan, place))
 }
 
 fn read_environment(

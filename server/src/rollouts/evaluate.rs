@@ -54,7 +54,6 @@ struct Plan {
     motions: Vec<Clip>,
     /// Number and seed of the procedural motions.
     procedural: (usize, u64),
-    place: Place,
 }
 
 /// Serves one call to its end.
@@ -63,23 +62,23 @@ pub(super) async fn run(
     mut inbound: Streaming<EvaluateRequest>,
     line: EvaluateLine,
 ) {
-    let Some(Plan {
-        policy,
-        retargeter,
-        network,
-        controller,
-        settings,
-        clip_frames,
-        motions,
-        procedural,
-        place,
-    }) = line.prepare(read_plan(&context, &mut inbound)).await
-    else {
-        return;
-    };
-    line.start(place, move |line, threads| {
-        let procedural = motion::procedural(procedural);
-        let clips = prepare(line, &network, [motions, procedural], clip_frames, threads)?;
+    let prepared = line.prepare(read_plan(&context, &mut inbound)).await;
+    if let Some((plan, place)) = prepared {
+        line.start(place, move |line, threads| plan.run(line, threads));
+    }
+}
+
+impl Plan {
+    /// The job, on its own thread.
+    fn run(self, line: &EvaluateLine, threads: usize) -> Result<(), ServiceError> {
+        let clips = self.prepare(line, threads)?;
+        let Self {
+            policy,
+            retargeter,
+            controller,
+            settings,
+            ..
+        } = self;
         let episodes = settings.episodes.unwrap_or(clips.len());
         line.send(response(Response::Started(EvaluationStarted {
             robot: policy.card.robot.clone(),
@@ -101,7 +100,37 @@ pub(super) async fn run(
             &evaluation,
             &policy.robot,
         ))))
-    });
+    }
+
+    /// Retargets the recorded and the procedural motions, and cuts them into clips.
+    fn prepare(&self, line: &EvaluateLine, threads: usize) -> Result<Vec<GoalClip>, ServiceError> {
+        let procedural = motion::procedural(self.procedural);
+        let total = self.motions.len() + procedural.len();
+        let sources = [
+            (&self.motions, Source::Recorded),
+            (&procedural, Source::Procedural),
+        ];
+        let mut before = 0;
+        let mut clips = Vec::new();
+        for (motions, source) in sources {
+            let progress = |done: usize| {
+                line.check()?;
+                line.send(response(Response::Preparing(EvaluationPreparing {
+                    done: wire::count(before + done),
+                    motions: wire::count(total),
+                })))
+            };
+            let goals = motion::retarget(&self.network, motions, source, threads, progress)?;
+            clips.extend(goals.iter().flat_map(|clip| clip.windows(self.clip_frames)));
+            before += motions.len();
+        }
+        if clips.is_empty() {
+            let shortest = GoalClip::SHORTEST_WINDOW;
+            let description = format!("every motion is shorter than {shortest} control periods");
+            return Err(FieldError::new("clip.poses", description).into());
+        }
+        Ok(clips)
+    }
 }
 
 fn response(message: Response) -> EvaluateResponse {
@@ -112,37 +141,6 @@ fn response(message: Response) -> EvaluateResponse {
 
 fn failed(error: SimError) -> ServiceError {
     ServiceError::JobFailed(error.to_string())
-}
-
-/// Retargets the recorded and the procedural motions, and cuts them into clips.
-fn prepare(
-    line: &EvaluateLine,
-    retargeter: &Retargeter,
-    motions: [Vec<Clip>; 2],
-    clip_frames: usize,
-    threads: usize,
-) -> Result<Vec<GoalClip>, ServiceError> {
-    let total: usize = motions.iter().map(Vec::len).sum();
-    let mut before = 0;
-    let mut clips = Vec::new();
-    for (motions, source) in motions.iter().zip([Source::Recorded, Source::Procedural]) {
-        let progress = |done: usize| {
-            line.check()?;
-            line.send(response(Response::Preparing(EvaluationPreparing {
-                done: wire::count(before + done),
-                motions: wire::count(total),
-            })))
-        };
-        let goals = motion::retarget(retargeter, motions, source, threads, progress)?;
-        clips.extend(goals.iter().flat_map(|clip| clip.windows(clip_frames)));
-        before += motions.len();
-    }
-    if clips.is_empty() {
-        let shortest = GoalClip::SHORTEST_WINDOW;
-        let description = format!("every motion is shorter than {shortest} control periods");
-        return Err(FieldError::new("clip.poses", description).into());
-    }
-    Ok(clips)
 }
 
 /// Reports episodes as they end.
@@ -184,7 +182,7 @@ impl Progress for Reporter<'_> {
 async fn read_plan(
     context: &RolloutContext,
     inbound: &mut Streaming<EvaluateRequest>,
-) -> Result<Plan, ServiceError> {
+) -> Result<(Plan, Place), ServiceError> {
     let config = match read::message(inbound)
         .await?
         .and_then(|first| first.message)
@@ -207,7 +205,7 @@ async fn read_plan(
         let description = "no motion was sent, and no procedural motion asked for";
         return Err(FieldError::new("config.procedural", description).into());
     }
-    Ok(Plan {
+    let plan = Plan {
         policy: Arc::clone(policy),
         retargeter: Arc::clone(retargeter),
         network,
@@ -219,8 +217,8 @@ async fn read_plan(
         },
         motions,
         procedural,
-        place,
-    })
+    };
+    Ok((plan, place))
 }
 
 fn read_settings(config: &EvaluateConfig, robot: &Robot) -> Result<EvaluationSettings, FieldError> {

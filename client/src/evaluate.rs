@@ -190,7 +190,7 @@ impl Outcome {
             ("procedural", &result.procedural),
         ];
         sets.into_iter()
-            .filter_map(|(name, set)| set.clone().map(|set| (name, set)))
+            .filter_map(|(name, set)| set.map(|set| (name, set)))
             .collect()
     }
 

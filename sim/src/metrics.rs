@@ -29,11 +29,11 @@ pub struct Metrics<T> {
     pub self_collision_share: T,
     /// exp(−10 ‖v‖₂²), v the base's velocity, m/s; more is better.
     pub mbv: T,
-    /// exp(−3 ‖v_t − v_{t−1}‖₂); more is better.
+    /// `exp(−3 ‖v_t − v_{t−1}‖₂)`; more is better.
     pub mba: T,
     /// exp(−10 (|roll| + |pitch|)); more is better.
     pub mbo: T,
-    /// ‖q̇_t − q̇_{t−1}‖₂² over the goal joints, (rad/s)²; less is better.
+    /// `‖q̇_t − q̇_{t−1}‖₂²` over the goal joints, (rad/s)²; less is better.
     pub mus: T,
 }
 

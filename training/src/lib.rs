@@ -1,6 +1,6 @@
 //! Training and its reports: losses, trainers, checkpoints of a run, and the `emp-train` command.
 //!
-//! This crate makes the weights that the other crates serve. It never serves, and no other crate depends on it.
+//! This crate makes the weights that the other crates serve. It never serves, and no crate but the end-to-end tests depends on it.
 #![forbid(unsafe_code)]
 
 pub mod log;

@@ -1,5 +1,7 @@
 //! `emp-train`: trains the models and reports on them.
 
+mod policy_report;
+
 use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
 
 use anyhow::{Context as _, Result, ensure};
@@ -52,6 +54,11 @@ enum Command {
     Policy(PolicyArguments),
     /// Draw the learning curves of policies.
     PolicyCurves(CurvesArguments),
+    /// Score a trained policy, bare and behind goal filters: held-out clips, larger amplitude, full randomisation.
+    ///
+    /// Recorded motion comes from --motions and should be of people that were not trained on; procedural skills come from a
+    /// seed of their own.
+    PolicyReport(policy_report::Arguments),
     /// Compare a trained retargeter with converged inverse kinematics on the same objective.
     RetargetReport(ReportArguments),
 }
@@ -145,7 +152,7 @@ struct PolicyArguments {
     /// How left–right symmetry is used.
     #[arg(long, value_enum, default_value_t = Symmetry::None)]
     symmetry: Symmetry,
-    /// Servers that simulate, for example http://host:50051; without any, this machine does. A resumed run needs as many.
+    /// Servers that simulate, for example `http://host:50051`; without any, this machine does. A resumed run needs as many.
     #[arg(long, num_args = 1.., value_name = "URL")]
     remote: Vec<String>,
     /// Continue the run from its checkpoint.
@@ -200,6 +207,7 @@ fn main() -> Result<ExitCode> {
             policy::curves::draw(&arguments.log, &arguments.out)?;
             Ok(ExitCode::SUCCESS)
         }
+        Command::PolicyReport(arguments) => policy_report::run(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),
     }
 }

@@ -212,7 +212,7 @@ impl Learner {
     fn batch(&self, rollout: &Rollout) -> Result<Batch> {
         let log_std = self.log_std()?;
         let normalizer = self.privileged.normalizer();
-        let values = |rows: &[f32]| self.values(normalized(rows, &normalizer));
+        let values = |rows: &[f32]| self.values(&normalized(rows, &normalizer));
         let state_values = values(&rollout.privileged)?;
         let mut rewards = rollout.rewards.clone();
         for (index, privileged) in &rollout.timed_out_privileged {
@@ -278,7 +278,7 @@ impl Learner {
     }
 
     /// Values of normalised privileged observations.
-    fn values(&self, privileged: Vec<f32>) -> Result<Vec<f32>> {
+    fn values(&self, privileged: &[f32]) -> Result<Vec<f32>> {
         let width = self.widths.privileged;
         let chunk = |rows: &[f32]| -> Result<Vec<f32>> {
             Ok(self.network.values(&tensor(rows, width)?)?.to_vec1()?)

@@ -9,6 +9,7 @@ pub mod moments;
 pub mod network;
 pub mod objective;
 pub mod remote;
+pub mod report;
 pub mod returns;
 pub mod settings;
 pub mod source;

@@ -269,3 +269,49 @@ fn unit(axis: Axis) -> &'static str {
 fn failed(error: impl fmt::Display) -> anyhow::Error {
     anyhow!("drawing the ladder: {error}")
 }
+
+#[cfg(test)]
+mod tests {
+    use emp_sim::{
+        ladder::LadderRow,
+        metrics::{Interval, Metrics},
+    };
+
+    use super::*;
+
+    #[test]
+    fn the_ladder_is_drawn_with_its_axes_and_controllers() {
+        let interval = |mean: f64| Interval {
+            mean,
+            low: 0.9 * mean,
+            high: mean,
+        };
+        let row = |controller: &str, axis, value: f64| LadderRow {
+            controller: controller.to_owned(),
+            rung: Rung { axis, value },
+            episodes: 10,
+            metrics: Metrics::from([interval(1.0 / (1.0 + value)); 8]),
+        };
+        let rows = Axis::ALL.into_iter().flat_map(|axis| {
+            let values = [0.5, 1.0, 1.5].into_iter();
+            values.flat_map(move |value| {
+                ["decoupled", "soft-knee"].map(|name| row(name, axis, value))
+            })
+        });
+        let ladder = Ladder {
+            rows: rows.collect(),
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("ladder.svg");
+        draw_ladder(&ladder, "emp27", &out).unwrap();
+        let svg = std::fs::read_to_string(out).unwrap();
+        for text in [
+            "emp27: success along hand load",
+            "soft-knee",
+            "kg in each hand",
+            "1.5 s",
+        ] {
+            assert!(svg.contains(text), "{text}");
+        }
+    }
+}

@@ -14,7 +14,7 @@ pub struct Trajectories<'a> {
     pub ended: &'a [bool],
 }
 
-/// Advantages A_t = Σ_k (γλ)ᵏ δ_{t+k} up to the episode's end, with δ_t = r_t + γ V_{t+1} − V_t; T × N.
+/// Advantages `A_t = Σ_k (γλ)ᵏ δ_{t+k}` up to the episode's end, with `δ_t = r_t + γ V_{t+1} − V_t`; T × N.
 pub fn advantages(trajectories: &Trajectories<'_>, discount: f64, trace_decay: f64) -> Vec<f32> {
     let n = trajectories.environments;
     let mut advantages = vec![0.0; trajectories.rewards.len()];

@@ -461,7 +461,6 @@ mod tests {
                 mjp: f64::from(number),
                 ..EpisodeMetrics::default()
             }),
-            ..EpisodeResult::default()
         }
     }
 

@@ -139,12 +139,9 @@ async fn read_plan(
     context: &RolloutContext,
     inbound: &mut Streaming<CollectRolloutsRequest>,
 ) -> Result<(Plan, Place), ServiceError> {
-    let config = match read::message(inbound)
-        .await?
-        .and_then(|first| first.message)
-    {
-        Some(Request::Config(config)) => config,
-        _ => return Err(FieldError::missing_config().into()),
+    let first = read::message(inbound).await?;
+    let Some(Request::Config(config)) = first.and_then(|first| first.message) else {
+        return Err(FieldError::missing_config().into());
     };
     let robot = Arc::clone(context.catalog.robot_for(&config.robot)?);
     let environment = read_environment(&config, &robot)?;

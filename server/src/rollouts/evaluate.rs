@@ -139,7 +139,7 @@ fn response(message: Response) -> EvaluateResponse {
     }
 }
 
-fn failed(error: SimError) -> ServiceError {
+fn failed(error: impl std::fmt::Display) -> ServiceError {
     ServiceError::JobFailed(error.to_string())
 }
 
@@ -183,12 +183,9 @@ async fn read_plan(
     context: &RolloutContext,
     inbound: &mut Streaming<EvaluateRequest>,
 ) -> Result<(Plan, Place), ServiceError> {
-    let config = match read::message(inbound)
-        .await?
-        .and_then(|first| first.message)
-    {
-        Some(Request::Config(config)) => config,
-        _ => return Err(FieldError::missing_config().into()),
+    let first = read::message(inbound).await?;
+    let Some(Request::Config(config)) = first.and_then(|first| first.message) else {
+        return Err(FieldError::missing_config().into());
     };
     let policy = context
         .catalog

@@ -156,7 +156,7 @@ impl<T: Send + 'static> Line<T> {
             let _ = set_current_thread_priority(ThreadPriority::Min);
             let started = Instant::now();
             let worked = catch_unwind(AssertUnwindSafe(|| work(&self, place.threads)));
-            let end = worked.unwrap_or_else(|panic| Err(panicked(panic)));
+            let end = worked.unwrap_or_else(|panic| Err(panicked(&*panic)));
             let seconds = started.elapsed().as_secs_f64();
             // The place is free before the client hears of the end and asks for the next.
             drop(place);
@@ -183,7 +183,7 @@ fn gone() -> ServiceError {
     ServiceError::Transport(Status::cancelled("the client left"))
 }
 
-fn panicked(payload: Box<dyn Any + Send>) -> ServiceError {
+fn panicked(payload: &(dyn Any + Send)) -> ServiceError {
     let message = payload
         .downcast_ref::<&str>()
         .copied()

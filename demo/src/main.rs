@@ -15,6 +15,8 @@ mod motion;
 mod output;
 mod picture;
 mod posture;
+#[cfg(feature = "render")]
+mod render;
 mod server;
 mod simulator;
 mod stance;
@@ -23,7 +25,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Parser;
 use emp_robot::Robot;
 use tokio::signal::unix::{SignalKind, signal};
@@ -64,6 +66,9 @@ struct Options {
     /// Push the robot's base every 5 s: what is added to its speed, m/s
     #[arg(long, value_name = "M/S", default_value_t = 0.0, value_parser = not_negative)]
     push: f64,
+    /// Also leave MuJoCo's own pictures, 25 a second, in frames/, and render.mp4 where ffmpeg is there; needs EGL
+    #[arg(long)]
+    render: bool,
     /// Print summary.json alone on standard output
     #[arg(long)]
     json: bool,
@@ -81,6 +86,10 @@ fn main() -> ExitCode {
 }
 
 fn run(options: &Options) -> Result<()> {
+    ensure!(
+        cfg!(feature = "render") || !options.render,
+        "this emp-demo was built without MuJoCo's renderer; build it with --features emp-demo/render"
+    );
     let folders = Folders::find(options.weights.as_deref())?;
     let robot = Robot::load(&folders.robot(&options.robot)?)?;
     let motion = Motion::load(options.motion.as_deref(), robot.control_rate_hz())?;
@@ -93,12 +102,17 @@ fn run(options: &Options) -> Result<()> {
         robot: Arc::new(robot),
         motion,
         out: options.out.clone(),
+        #[cfg(feature = "render")]
+        render: options.render,
     });
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .context("tokio runtime")?;
-    let summary = runtime.block_on(demo.play(&folders))?;
+    let outcome = runtime.block_on(demo.play(&folders));
+    // Whoever interrupts the demo does not wait for pictures.
+    runtime.shutdown_background();
+    let (summary, files) = outcome?;
     if options.json {
         print!("{}", summary.json()?);
     } else {
@@ -106,7 +120,7 @@ fn run(options: &Options) -> Result<()> {
         println!(
             "  written to {}: {}",
             options.out.display(),
-            output::FILES.join(", ")
+            files.join(", ")
         );
     }
     Ok(())
@@ -127,11 +141,16 @@ struct Demo {
     seed: u64,
     conditions: Conditions,
     out: PathBuf,
+    #[cfg(feature = "render")]
+    render: bool,
 }
+
+/// What is said of a run, and the names of the files that it left.
+type Outcome = (Summary, Vec<&'static str>);
 
 impl Demo {
     /// Plays the motion through a server of its own, which is gone when this returns, whatever happened.
-    async fn play(self: Arc<Self>, folders: &Folders) -> Result<Summary> {
+    async fn play(self: Arc<Self>, folders: &Folders) -> Result<Outcome> {
         let mut interrupted = signal(SignalKind::interrupt()).context("SIGINT")?;
         let mut terminated = signal(SignalKind::terminate()).context("SIGTERM")?;
         let mut server = Server::spawn(folders)?;
@@ -141,12 +160,12 @@ impl Demo {
             _ = terminated.recv() => bail_interrupted(),
         };
         let stopped = server.stop().await;
-        let summary = result?;
+        let outcome = result?;
         stopped?;
-        Ok(summary)
+        Ok(outcome)
     }
 
-    async fn follow_and_show(self: Arc<Self>, server: &mut Server) -> Result<Summary> {
+    async fn follow_and_show(self: Arc<Self>, server: &mut Server) -> Result<Outcome> {
         let url = server.url().await?;
         eprintln!(
             "emp-server at {url}: {} follows {} for {:.1} s",
@@ -162,14 +181,19 @@ impl Demo {
     }
 
     /// Measures, draws, and writes everything down.
-    fn show(&self, run: &Run) -> Result<Summary> {
+    fn show(&self, run: &Run) -> Result<Outcome> {
         let (robot, motion) = (&*self.robot, &self.motion);
         let postures = postures(robot, run)?;
         let conditions = (self.seed, &self.conditions);
         let (summary, errors) = measure::summary(robot, motion, conditions, run, &postures)?;
         let sheets = output::sheets(robot, motion, run, &postures, &errors, &summary)?;
-        output::write(&self.out, robot, run, &summary, &sheets)?;
-        Ok(summary)
+        let files = output::write(&self.out, robot, run, &summary, &sheets)?;
+        #[cfg(feature = "render")]
+        let files = match self.render {
+            true => [files, render::render(robot, run, &self.out)?].concat(),
+            false => files,
+        };
+        Ok((summary, files))
     }
 }
 

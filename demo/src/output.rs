@@ -16,7 +16,7 @@ use crate::picture::{Moment, Sheet, StanceSheet, differing};
 use crate::posture::Posture;
 
 /// The files, in the order in which they are written.
-pub(crate) const FILES: [&str; 4] = [
+const FILES: [&str; 4] = [
     "joints.csv",
     "summary.json",
     "contact-sheet.png",
@@ -100,19 +100,20 @@ fn last_of_fall(run: &Run) -> Option<usize> {
     run.fall.and_then(|_| run.periods.len().checked_sub(1))
 }
 
-/// Writes every file under a temporary name and renames it when it is whole.
+/// Writes every file under a temporary name and renames it when it is whole; gives their names.
 pub(crate) fn write(
     out: &Path,
     robot: &Robot,
     run: &Run,
     summary: &Summary,
     sheets: &[Vec<u8>; 2],
-) -> Result<()> {
+) -> Result<Vec<&'static str>> {
     let [joints, json, contact, stance] = FILES.map(|name| out.join(name));
     write_joints(&joints, robot, run)?;
     write_whole(&json, summary.json()?.as_bytes())?;
     write_whole(&contact, &sheets[0])?;
-    write_whole(&stance, &sheets[1])
+    write_whole(&stance, &sheets[1])?;
+    Ok(FILES.to_vec())
 }
 
 /// A row a frame: the goals as the retargeter answered, what all motors followed, and what was then measured.

@@ -29,7 +29,7 @@ pub(crate) fn postures(robot: &Robot, run: &Run) -> Result<Vec<Posture>> {
             stance: Stance::new(&period.reading, &pose),
             legs: pose
                 .legs
-                .map(|leg| leg.into_iter().map(|point| point.cast()).collect()),
+                .map(|leg| leg.into_iter().map(Vector3::cast).collect()),
         }
     };
     Ok(run.periods.iter().map(posture).collect())

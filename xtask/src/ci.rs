@@ -30,6 +30,7 @@ pub(crate) fn run(workspace: &Workspace) -> Result<()> {
         workspace.run(workspace.cargo().args(["fmt", "--all", "--check"]))
     });
     steps.run("lints", || clippy(workspace));
+    steps.run("the demo with MuJoCo's renderer", || render(workspace));
     steps.run("documentation", || documentation(workspace));
     steps.run("licences, bans and sources", || deny(workspace, &tools));
     steps.run("advisories", || advisories(workspace, &tools));
@@ -110,6 +111,12 @@ fn clippy(workspace: &Workspace) -> Result<()> {
     workspace.run(workspace.cargo().args(lints))
 }
 
+/// The one feature that is off by default is only checked: running it needs a graphics library.
+fn render(workspace: &Workspace) -> Result<()> {
+    let check = ["check", "--release", "--workspace", "--bins"];
+    workspace.run(workspace.cargo().args(check).args(demo::RENDER))
+}
+
 /// Warnings are errors; set as `RUSTDOCFLAGS` for this step only, since it replaces the flags by which documentation tests
 /// find MuJoCo.
 fn documentation(workspace: &Workspace) -> Result<()> {
@@ -154,10 +161,9 @@ fn demo_on(workspace: &Workspace, robot: &str) -> Result<()> {
     demo::run(
         workspace,
         &DemoArgs {
-            motion: None,
             robot: robot.to_owned(),
             out: Some(out),
-            json: false,
+            ..DemoArgs::default()
         },
     )
 }

@@ -11,8 +11,11 @@ use crate::{
     workspace::Workspace,
 };
 
+/// Builds the demo with MuJoCo's renderer.
+pub(crate) const RENDER: [&str; 2] = ["--features", "emp-demo/render"];
+
 /// What of `emp-demo`'s options is of use here.
-#[derive(Args)]
+#[derive(Args, Default)]
 pub(crate) struct DemoArgs {
     /// A recorded motion: .bvh, AMASS .npz or key-node .npz [default: a procedural medley]
     #[arg(long, value_name = "FILE")]
@@ -20,9 +23,24 @@ pub(crate) struct DemoArgs {
     /// The robot, a folder of robots/; g1 is fetched when needed
     #[arg(long, value_name = "NAME", default_value = "emp27")]
     pub(crate) robot: String,
-    /// Where joints.csv, summary.json and contact-sheet.png go [default: out/demo]
+    /// Where joints.csv, summary.json and the pictures go [default: out/demo]
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
+    /// Other weights than those in models/weights
+    #[arg(long, value_name = "DIR")]
+    pub(crate) weights: Option<PathBuf>,
+    /// Seed of what is random: hand loads, directions of pushes
+    #[arg(long, default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Mass in each hand, kg [default: drawn from the robot's range for tests]
+    #[arg(long, value_name = "KG")]
+    pub(crate) load: Option<f64>,
+    /// Push the robot's base every 5 s: what is added to its speed, m/s
+    #[arg(long, value_name = "M/S")]
+    pub(crate) push: Option<f64>,
+    /// Also leave MuJoCo's own pictures, 25 a second, in frames/, and render.mp4 where ffmpeg is there; needs EGL
+    #[arg(long)]
+    pub(crate) render: bool,
     /// Print summary.json alone on standard output
     #[arg(long)]
     pub(crate) json: bool,
@@ -36,21 +54,32 @@ pub(crate) fn run(workspace: &Workspace, args: &DemoArgs) -> Result<()> {
     }
     // The whole workspace's programs, as the tests build them: another choice of packages would choose other features of
     // their dependencies, and compile these once more.
-    workspace.run(
-        workspace
-            .cargo()
-            .args(["build", "--release", "--workspace", "--bins"]),
-    )?;
+    let mut build = workspace.cargo();
+    build.args(["build", "--release", "--workspace", "--bins"]);
+    if args.render {
+        build.args(RENDER);
+    }
+    workspace.run(&mut build)?;
     let mut demo = workspace.command(workspace.binary("emp-demo"));
-    demo.args(["--robot", &args.robot]);
-    if let Some(motion) = &args.motion {
-        demo.arg("--motion").arg(absolute(motion)?);
+    demo.args(["--robot", &args.robot, "--seed", &args.seed.to_string()]);
+    for (option, path) in [
+        ("--motion", &args.motion),
+        ("--out", &args.out),
+        ("--weights", &args.weights),
+    ] {
+        if let Some(path) = path {
+            demo.arg(option).arg(absolute(path)?);
+        }
     }
-    if let Some(out) = &args.out {
-        demo.arg("--out").arg(absolute(out)?);
+    for (option, number) in [("--load", args.load), ("--push", args.push)] {
+        if let Some(number) = number {
+            demo.arg(format!("{option}={number}"));
+        }
     }
-    if args.json {
-        demo.arg("--json");
+    for (option, wanted) in [("--render", args.render), ("--json", args.json)] {
+        if wanted {
+            demo.arg(option);
+        }
     }
     workspace.run(&mut demo)
 }

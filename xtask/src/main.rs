@@ -44,10 +44,10 @@ enum Command {
         /// Which robot: g1 is Unitree's G1, from the PyPI wheel of mjlab
         robot: FetchedRobot,
     },
-    /// Stream a motion through a real server and draw what the robot does with it
+    /// Let a simulated robot follow a motion on its own feet, controlled by a real server in real time
     ///
-    /// Builds emp-server and emp-demo for release and runs the demo, which leaves joints.csv, summary.json and
-    /// contact-sheet.png in out/demo/.
+    /// Builds emp-server and emp-demo for release and runs the demo, which leaves joints.csv, summary.json,
+    /// contact-sheet.png and stance-sheet.png in out/demo/. A robot that falls is a result: the exit code is 0.
     Demo(demo::DemoArgs),
     /// Run every test of the workspace, documentation tests included, in the release profile
     Test {

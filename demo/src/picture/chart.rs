@@ -112,9 +112,9 @@ impl Chart {
         }
     }
 
-    /// A number on a disc, at a time, on the upper border of the curves.
+    /// A number on a disc, at a time, on the lower border of the curves.
     pub(super) fn tag(&self, canvas: &mut Canvas, time: f32, text: &str) {
-        let at = self.place(time, self.values[1]);
+        let at = self.place(time, self.values[0]);
         tag(canvas, at, text);
     }
 

@@ -35,8 +35,8 @@ const UNDER_LEFT: Rgb = [206, 226, 240];
 const UNDER_RIGHT: Rgb = [246, 222, 206];
 
 /// Smallest and largest ends of the charts' axes, degrees and centimetres: small sways show, and a fall does not hide them.
-const TILT_AXIS: [f32; 2] = [3.0, 30.0];
-const WAY_AXIS: [f32; 2] = [6.0, 40.0];
+const TILT_AXIS: [f32; 2] = [3.0, 15.0];
+const WAY_AXIS: [f32; 2] = [6.0, 30.0];
 
 /// A sheet about how the robot stood.
 pub(crate) struct StanceSheet<'a> {

@@ -28,6 +28,9 @@ const AMPLITUDE: f64 = 1.2;
 /// Episodes of the trial under full randomisation, and their frames: ten seconds.
 const RANDOMIZED: (u64, usize) = (500, 500);
 
+/// Failures of a trial that the text lists.
+const LISTED: usize = 12;
+
 /// Size of one panel of the ladder's picture, pixels.
 const PANEL: (u32, u32) = (480, 360);
 
@@ -151,9 +154,12 @@ impl fmt::Display for Report {
             }
             for Failure {
                 clip, time, reason, ..
-            } in &evaluation.failures
+            } in evaluation.failures.iter().take(LISTED)
             {
                 writeln!(f, "  {clip} at {time:.2} s: {reason}")?;
+            }
+            if let Some(more) = evaluation.failures.len().checked_sub(LISTED + 1) {
+                writeln!(f, "  and {} more, all in --json", more + 1)?;
             }
         }
         Ok(())

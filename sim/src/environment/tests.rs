@@ -493,10 +493,10 @@ fn a_divergence_ends_its_own_episode_and_no_neighbour_notices() {
         }
         let ends = healthy.step(&good).ends.to_vec();
         let step = sick.step(&bad);
-        for n in 0..6 {
+        for (n, &end) in ends.iter().enumerate() {
             let expected = match (t, n) {
                 (2, 3) => Some(EndReason::Diverged(Divergence::Control)),
-                _ => ends[n],
+                _ => end,
             };
             if (t, n) == (2, 3) {
                 assert_eq!(step.rewards[n], 0.0);

@@ -29,6 +29,9 @@ const ROUNDS: usize = 15;
 /// Hidden layers of the policy.
 const HIDDEN: [usize; 3] = [256, 128, 64];
 
+/// One round of one kind of work; answers how long it took.
+type Round<'a> = Box<dyn FnMut() -> Duration + 'a>;
+
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
     let option = |name: &str| {
@@ -56,7 +59,7 @@ fn measure(robot: &Arc<Robot>, threads: usize) {
     let pool = Arc::new(Pool::new(robot, threads, Priority::Normal).expect("a pool"));
     let policy = policy(robot);
     let library = Arc::new(standing(robot));
-    let mut kinds: Vec<(&str, Box<dyn FnMut() -> Duration>)> = vec![
+    let mut kinds: Vec<(&str, Round<'_>)> = vec![
         ("mj_step loop", Box::new(bare(robot, threads))),
         (
             "pool, nominal",

@@ -580,9 +580,8 @@ async fn a_robot_without_a_policy_says_so() -> anyhow::Result<()> {
     std::fs::remove_file(policy::file(&weights))?;
     let server = TestServer::start_with(weights.path(), |_| {})?;
     let client = Client::connect(&server.url()).await?;
-    let error = match client.policy_stream(PolicyConfig::for_robot("emp27")).await {
-        Ok(_) => panic!("a policy from nowhere"),
-        Err(error) => error,
+    let Err(error) = client.policy_stream(PolicyConfig::for_robot("emp27")).await else {
+        panic!("a policy from nowhere")
     };
     assert_eq!(error.code(), Some(Code::InvalidArgument));
     assert!(error.to_string().contains("robot with a policy"), "{error}");

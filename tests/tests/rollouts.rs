@@ -176,7 +176,7 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
     let mut results = Vec::new();
     for threads in [1, 2] {
         let server = TestServer::start_with(weights.path(), |settings| {
-            settings.rollouts.threads = threads
+            settings.rollouts.threads = threads;
         })?;
         let client = Client::connect(&server.url()).await?;
         let evaluation = client.evaluate(config.clone(), recorded()).await?;
@@ -465,7 +465,7 @@ async fn a_job_beyond_the_limit_is_refused_and_a_cancelled_one_makes_room() -> a
     let learner = client
         .collect_rollouts(collect_config(0..4), library()?)
         .await;
-    let error = learner.err().expect("no place");
+    let error = learner.expect_err("no place");
     assert_eq!(error.code(), Some(Code::ResourceExhausted));
 
     drop(running);

@@ -144,10 +144,7 @@ impl RolloutSource for RemoteSource {
             server.snapshot = Some(snapshot);
             server.journal.clear();
         }
-        self.each(|server| async move {
-            let result = server.connected().await.map(|_| ());
-            result.map_err(|error| server.failed(error))
-        })?;
+        // The next request connects anew, and waits where a server has not yet seen that the call before is over.
         Ok(())
     }
 }

@@ -5,7 +5,8 @@ use std::{env, error::Error, fs, path::PathBuf};
 
 use prost::Message as _;
 
-const FILES: [&str; 6] = [
+const FILES: [&str; 7] = [
+    "emp/v1/filter.proto",
     "emp/v1/frame.proto",
     "emp/v1/model_service.proto",
     "emp/v1/motion_service.proto",

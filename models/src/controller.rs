@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     ModelError,
+    emp::Emp,
+    filters::{self, FilterError},
     observation::{History, ObservationLayout, RobotState},
     policy::Policy,
 };
@@ -33,6 +35,19 @@ pub struct FilterItem<'a> {
     pub goal: &'a mut [f32],
     /// What the filter remembers of this robot; empty at reset, otherwise the filter's own.
     pub memory: &'a mut Vec<f32>,
+    /// How dangerous the filter finds the goal, for filters that judge it; none before.
+    pub risk: &'a mut Option<Risk>,
+}
+
+/// How dangerous an EMP finds a goal.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Risk {
+    /// Mean of z² over the latent's dimensions.
+    pub regloss: f32,
+    /// Whether the danger gate is passed.
+    pub danger: bool,
+    /// Share of the correction that is executed, 0 to 1.
+    pub applied: f32,
 }
 
 /// One robot's past.
@@ -78,6 +93,8 @@ pub struct ControllerOutput {
     pub action: Vec<f32>,
     /// Targets of the leg joints, rad, inside their ranges.
     pub leg_targets: Vec<f32>,
+    /// How dangerous the filter finds the goal; none without an EMP.
+    pub risk: Option<Risk>,
 }
 
 /// A policy with an optional goal filter before it.
@@ -94,6 +111,19 @@ impl Controller {
     /// A controller; without a filter it is the paper's decoupled policy.
     pub fn new(policy: Arc<Policy>, filter: Option<Arc<dyn GoalFilter>>) -> Self {
         Self { policy, filter }
+    }
+
+    /// The controller that `specification` asks for: [`Self::DECOUPLED`] or a filter of [`filters::LIST`], with parameters.
+    ///
+    /// # Errors
+    /// As of [`filters::by_name`].
+    pub fn by_name(
+        specification: &str,
+        policy: &Arc<Policy>,
+        emp: Option<&Arc<Emp>>,
+    ) -> Result<Self, FilterError> {
+        let filter = filters::by_name(specification, policy.robot(), emp)?;
+        Ok(Self::new(Arc::clone(policy), filter))
     }
 
     /// The filter's name, or [`Self::DECOUPLED`].
@@ -136,13 +166,15 @@ impl Controller {
             robot.history.push(&input.state, input.goal);
         }
         let mut goals: Vec<Vec<f32>> = batch.iter().map(|(_, input)| input.goal.to_vec()).collect();
+        let mut risks = vec![None; batch.len()];
         if let Some(filter) = &self.filter {
-            let robots = batch.iter_mut().zip(&mut goals);
+            let robots = batch.iter_mut().zip(&mut goals).zip(&mut risks);
             let mut items: Vec<FilterItem<'_>> = robots
-                .map(|((robot, _), goal)| FilterItem {
+                .map(|(((robot, _), goal), risk)| FilterItem {
                     observation: robot.history.stack(),
                     goal,
                     memory: &mut robot.filter_memory,
+                    risk,
                 })
                 .collect();
             filter.filter(&mut items)?;
@@ -156,14 +188,16 @@ impl Controller {
         }
         let actions = self.policy.actions(&observations)?;
         let legs = self.layout().last_action().len();
-        let answers = batch.iter_mut().zip(goals).zip(actions.chunks_exact(legs));
+        let answers = batch.iter_mut().zip(goals).zip(risks);
         Ok(answers
-            .map(|(((robot, _), goal), action)| {
+            .zip(actions.chunks_exact(legs))
+            .map(|((((robot, _), goal), risk), action)| {
                 robot.history.set_last_action(action);
                 ControllerOutput {
                     goal,
                     action: action.to_vec(),
                     leg_targets: self.policy.leg_targets(action),
+                    risk,
                 }
             })
             .collect())

@@ -1,5 +1,5 @@
 //! Networks and what they need around them: the linear op, robot kinematics as a differentiable op, checkpoints, the
-//! human-to-robot retargeter, the observation history, the lower-body policy, and the controller that puts them in order.
+//! human-to-robot retargeter, the observation history, the lower-body policy, the Executable Motion Prior, and the controller that puts them in order.
 //!
 //! This crate turns human key nodes into robot joint angles and robot states into joint targets. It never opens a socket, never steps physics, and never
 //! reads a motion file: frames come in as values, answers go out as values.
@@ -8,6 +8,7 @@
 pub mod activation;
 pub mod checkpoint;
 pub mod controller;
+pub mod emp;
 pub mod error;
 pub mod filters;
 pub mod kinematics;

@@ -7,6 +7,7 @@
 
 use std::ops::Range;
 
+use candle_core::{IndexOp as _, Tensor};
 use emp_robot::Robot;
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -89,6 +90,101 @@ impl ObservationLayout {
     /// The newest frame's goal within a stack.
     pub fn newest_goal(&self) -> Range<usize> {
         self.width() - self.goals..self.width()
+    }
+}
+
+/// The constant first layer of the networks that read stacks: feature block k is `Σ_t map[k][t] · s_t`, frames oldest first.
+///
+/// It mixes the frames of a stack, the same way for each number of a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct HistoryMap(Vec<Vec<f32>>);
+
+impl HistoryMap {
+    /// Every frame as it is: the features are the stack.
+    pub fn identity(history: usize) -> Self {
+        let row = |frame| {
+            (0..history)
+                .map(|t| f32::from(u8::from(t == frame)))
+                .collect()
+        };
+        Self((0..history).map(row).collect())
+    }
+
+    /// `s_t`, `s_t` − `s_{t−1}`, `s_{t−1}` − `s_{t−3}` and `s_t` − mean, over [`HISTORY`] frames.
+    pub fn differences() -> Self {
+        let newest = HISTORY - 1;
+        let mut map = vec![vec![0.0; HISTORY]; 4];
+        map[0][newest] = 1.0;
+        map[1][newest] = 1.0;
+        map[1][newest - 1] = -1.0;
+        map[2][newest - 1] = 1.0;
+        map[2][newest - 3] = -1.0;
+        map[3].fill(-1.0 / HISTORY as f32);
+        map[3][newest] += 1.0;
+        Self(map)
+    }
+
+    /// Numbers that come out for one stack.
+    pub fn features(&self, layout: &ObservationLayout) -> usize {
+        self.0.len() * layout.frame_width()
+    }
+
+    /// Applies the map to stacks (N × [`ObservationLayout::width`]); `features` becomes N × [`features`](Self::features).
+    pub fn apply(&self, layout: &ObservationLayout, stacks: &[f32], features: &mut Vec<f32>) {
+        let width = layout.frame_width();
+        features.clear();
+        for stack in stacks.chunks_exact(layout.width()) {
+            for weights in &self.0 {
+                let start = features.len();
+                features.resize(start + width, 0.0);
+                let block = &mut features[start..];
+                for (frame, &weight) in stack.chunks_exact(width).zip(weights) {
+                    if weight != 0.0 {
+                        for (feature, value) in block.iter_mut().zip(frame) {
+                            *feature += weight * value;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// As [`apply`](Self::apply), differentiable: stacks N × [`ObservationLayout::width`] to features.
+    ///
+    /// # Errors
+    /// When `stacks` has another width.
+    pub fn project(
+        &self,
+        layout: &ObservationLayout,
+        stacks: &Tensor,
+    ) -> candle_core::Result<Tensor> {
+        let (rows, width) = (stacks.dim(0)?, layout.frame_width());
+        let frames = stacks.reshape((rows, layout.history(), width))?;
+        let blocks = self.0.iter().map(|weights| {
+            let used = weights
+                .iter()
+                .enumerate()
+                .filter(|(_, weight)| **weight != 0.0);
+            let mut block = Tensor::zeros((rows, width), stacks.dtype(), stacks.device())?;
+            for (t, &weight) in used {
+                block = (block + (frames.i((.., t))? * f64::from(weight))?)?;
+            }
+            Ok(block)
+        });
+        Tensor::cat(&blocks.collect::<candle_core::Result<Vec<_>>>()?, 1)
+    }
+
+    /// Refuses a map for stacks of another length.
+    pub(crate) fn check(&self, layout: &ObservationLayout) -> Result<(), String> {
+        let history = layout.history();
+        match self.0.iter().find(|row| row.len() != history) {
+            Some(row) => Err(format!(
+                "a row of history_map has {} numbers, expected {history}",
+                row.len()
+            )),
+            None => Ok(()),
+        }
     }
 }
 
@@ -314,5 +410,53 @@ mod tests {
         let [x, y, z] = projected_gravity(&pitched);
         assert!((x - 0.3_f64.sin()).abs() < 1e-12 && y.abs() < 1e-12);
         assert!((z + 0.3_f64.cos()).abs() < 1e-12);
+    }
+
+    /// One stack whose frame t holds t² everywhere.
+    fn squares(layout: &ObservationLayout) -> Vec<f32> {
+        let width = layout.frame_width();
+        (0..layout.width())
+            .map(|i| ((i / width) as f32).powi(2))
+            .collect()
+    }
+
+    #[test]
+    fn the_map_of_differences_is_differences_and_a_deviation() {
+        let layout = layout();
+        let map = HistoryMap::differences();
+        let mut features = Vec::new();
+        map.apply(&layout, &squares(&layout), &mut features);
+        let mean = 1015.0 / 15.0;
+        let expected = [196.0, 196.0 - 169.0, 169.0 - 121.0, 196.0 - mean];
+        assert_eq!(features.len(), map.features(&layout));
+        for (block, expected) in features.chunks(layout.frame_width()).zip(expected) {
+            assert!(
+                block.iter().all(|x| (x - expected).abs() < 1e-3),
+                "{block:?} {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn projecting_tensors_is_applying_to_numbers() {
+        let layout = layout();
+        let stacks: Vec<f32> = (0..3 * layout.width())
+            .map(|i| (i as f32 * 0.37).sin())
+            .collect();
+        let tensor = Tensor::new(stacks.as_slice(), &candle_core::Device::Cpu).unwrap();
+        let tensor = tensor.reshape((3, layout.width())).unwrap();
+        for map in [HistoryMap::differences(), HistoryMap::identity(HISTORY)] {
+            let mut expected = Vec::new();
+            map.apply(&layout, &stacks, &mut expected);
+            let projected = map.project(&layout, &tensor).unwrap();
+            assert_eq!(projected.dims(), [3, map.features(&layout)]);
+            let projected: Vec<f32> = projected.flatten_all().unwrap().to_vec1().unwrap();
+            for (a, b) in projected.iter().zip(&expected) {
+                assert!((a - b).abs() < 1e-5, "{a} {b}");
+            }
+        }
+        let mut features = Vec::new();
+        HistoryMap::identity(HISTORY).apply(&layout, &stacks, &mut features);
+        assert_eq!(features, stacks);
     }
 }

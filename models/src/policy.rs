@@ -19,7 +19,7 @@ use crate::{
     CheckpointMetadata, ModelError, activation,
     checkpoint::{self, Tensors},
     linear::Linear,
-    observation::{HISTORY, ObservationLayout},
+    observation::{HISTORY, HistoryMap, ObservationLayout},
 };
 
 /// The kind that a policy's checkpoint names.
@@ -40,8 +40,8 @@ const NORMALIZER: [&str; 2] = ["normalizer.mean", "normalizer.scale"];
 pub struct PolicyConfig {
     /// Where each part of the observation stands.
     pub observation: ObservationLayout,
-    /// The constant first layer: feature block k is `Σ_t history_map[k][t] · s_t`, frames oldest first.
-    pub history_map: Vec<Vec<f32>>,
+    /// The constant first layer.
+    pub history_map: HistoryMap,
     /// Widths of the hidden layers.
     pub hidden: Vec<usize>,
 }
@@ -49,45 +49,16 @@ pub struct PolicyConfig {
 impl PolicyConfig {
     /// The shipped shape for `robot`: `s_t`, `s_t` − `s_{t−1}`, `s_{t−1}` − `s_{t−3}` and `s_t` − mean, then `hidden` layers.
     pub fn new(robot: &Robot, hidden: Vec<usize>) -> Self {
-        let newest = HISTORY - 1;
-        let mut map = vec![vec![0.0; HISTORY]; 4];
-        map[0][newest] = 1.0;
-        map[1][newest] = 1.0;
-        map[1][newest - 1] = -1.0;
-        map[2][newest - 1] = 1.0;
-        map[2][newest - 3] = -1.0;
-        map[3].fill(-1.0 / HISTORY as f32);
-        map[3][newest] += 1.0;
         Self {
             observation: ObservationLayout::new(robot, HISTORY),
-            history_map: map,
+            history_map: HistoryMap::differences(),
             hidden,
         }
     }
 
     /// Numbers that the network reads: one frame for each row of the history map.
     pub fn features(&self) -> usize {
-        self.history_map.len() * self.observation.frame_width()
-    }
-
-    /// Applies the history map to stacks (N × [`ObservationLayout::width`]); N × [`features`](Self::features).
-    pub fn map_history(&self, observations: &[f32], features: &mut Vec<f32>) {
-        let width = self.observation.frame_width();
-        features.clear();
-        for stack in observations.chunks_exact(self.observation.width()) {
-            for weights in &self.history_map {
-                let start = features.len();
-                features.resize(start + width, 0.0);
-                let block = &mut features[start..];
-                for (frame, &weight) in stack.chunks_exact(width).zip(weights) {
-                    if weight != 0.0 {
-                        for (feature, value) in block.iter_mut().zip(frame) {
-                            *feature += weight * value;
-                        }
-                    }
-                }
-            }
-        }
+        self.history_map.features(&self.observation)
     }
 
     /// Refuses a shape that does not fit `robot`.
@@ -99,14 +70,7 @@ impl PolicyConfig {
                 self.observation
             ));
         }
-        let history = self.observation.history();
-        match self.history_map.iter().find(|row| row.len() != history) {
-            Some(row) => Err(format!(
-                "a row of history_map has {} numbers, expected {history}",
-                row.len()
-            )),
-            None => Ok(()),
-        }
+        self.history_map.check(&self.observation)
     }
 }
 
@@ -137,7 +101,19 @@ impl Normalizer {
         }
     }
 
-    /// The tensors of a policy's checkpoint.
+    /// As [`apply`](Self::apply), differentiable.
+    ///
+    /// # Errors
+    /// When `features` has another width.
+    pub fn forward(&self, features: &Tensor) -> candle_core::Result<Tensor> {
+        let row = |values: &[f32]| Tensor::new(values, features.device());
+        features
+            .broadcast_sub(&row(&self.mean)?)?
+            .broadcast_mul(&row(&self.scale)?)?
+            .clamp(-CLIP, CLIP)
+    }
+
+    /// The tensors of a checkpoint.
     ///
     /// # Errors
     /// When a tensor cannot be made.
@@ -151,7 +127,11 @@ impl Normalizer {
         ])
     }
 
-    fn from_tensors(tensors: &Tensors, features: usize) -> Result<Self, String> {
+    /// The normaliser of `features` numbers in a checkpoint's tensors.
+    ///
+    /// # Errors
+    /// Says which tensor is missing or wrong.
+    pub(crate) fn from_tensors(tensors: &Tensors, features: usize) -> Result<Self, String> {
         let read = |name: &str| {
             let tensor = tensors.get(name).ok_or(format!("no tensor `{name}`"))?;
             let values = tensor
@@ -370,7 +350,10 @@ impl Policy {
     /// The features (N × [`PolicyConfig::features`], not normalised) of stacks (N × [`ObservationLayout::width`]).
     pub fn features(&self, observations: &[f32]) -> Vec<f32> {
         let mut features = Vec::new();
-        self.config.map_history(observations, &mut features);
+        let config = &self.config;
+        config
+            .history_map
+            .apply(&config.observation, observations, &mut features);
         features
     }
 
@@ -396,6 +379,16 @@ impl Policy {
     /// When the tensor library fails.
     pub fn actions(&self, observations: &[f32]) -> Result<Vec<f32>, ModelError> {
         self.actions_from_features(self.features(observations))
+    }
+
+    /// As [`actions`](Self::actions), differentiable: stacks N × [`ObservationLayout::width`] to actions N × leg joints.
+    ///
+    /// # Errors
+    /// When `stacks` has another width.
+    pub fn forward(&self, stacks: &Tensor) -> candle_core::Result<Tensor> {
+        let config = &self.config;
+        let features = config.history_map.project(&config.observation, stacks)?;
+        self.network.forward(&self.normalizer.forward(&features)?)
     }
 
     /// Leg targets (rad, inside the joints' ranges) of one action: default + scale · action.
@@ -455,28 +448,6 @@ mod tests {
     }
 
     #[test]
-    fn the_history_map_is_differences_and_a_deviation() {
-        let robot = robot();
-        let config = PolicyConfig::new(&robot, vec![8]);
-        let width = config.observation.frame_width();
-        // Frame t holds t² everywhere.
-        let stack: Vec<f32> = (0..HISTORY * width)
-            .map(|i| ((i / width) as f32).powi(2))
-            .collect();
-        let mut features = Vec::new();
-        config.map_history(&stack, &mut features);
-        let mean = 1015.0 / 15.0;
-        let expected = [196.0, 196.0 - 169.0, 169.0 - 121.0, 196.0 - mean];
-        for (block, expected) in features.chunks(width).zip(expected) {
-            assert!(
-                block.iter().all(|x| (x - expected).abs() < 1e-3),
-                "{block:?} {expected}"
-            );
-        }
-        assert_eq!(features.len(), config.features());
-    }
-
-    #[test]
     fn a_saved_policy_loads_and_a_batch_equals_its_rows() {
         let (robot, folder) = (robot(), tempfile::tempdir().unwrap());
         let path = folder.path().join("policy.safetensors");
@@ -493,6 +464,11 @@ mod tests {
             }
         }
         assert!(policy.actions(&[]).unwrap().is_empty());
+        let tensor = Tensor::from_vec(stacks.clone(), (5, width), &Device::Cpu).unwrap();
+        let tensor = policy.forward(&tensor).unwrap().flatten_all().unwrap();
+        for (a, b) in tensor.to_vec1::<f32>().unwrap().iter().zip(&batch) {
+            assert!((a - b).abs() < 1e-4, "{a} {b}");
+        }
         let sent = policy.encode().unwrap();
         let received = Policy::decode(&sent, "sent".as_ref(), robot).unwrap();
         assert_eq!(received.actions(&stacks).unwrap(), batch);
@@ -505,7 +481,7 @@ mod tests {
         let (robot, folder) = (robot(), tempfile::tempdir().unwrap());
         let path = folder.path().join("policy.safetensors");
         let mut config = PolicyConfig::new(&robot, vec![8]);
-        config.history_map[2].pop();
+        config.history_map = HistoryMap::identity(HISTORY - 1);
         save(&path, &config, &robot);
         let error = Policy::load(&path, robot).unwrap_err().to_string();
         assert!(error.contains("history_map"), "{error}");

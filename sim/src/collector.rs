@@ -162,7 +162,10 @@ impl Collector {
             }
             let start = Instant::now();
             let observations = self.environments.observations();
-            policy.config().map_history(observations, &mut features);
+            let config = policy.config();
+            config
+                .history_map
+                .apply(&config.observation, observations, &mut features);
             let means = policy.actions_from_features(features.clone())?;
             self.inference_time += start.elapsed();
             let actions = explore(&mut self.noise, &means, &std);

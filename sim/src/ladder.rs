@@ -275,10 +275,8 @@ mod tests {
         let pool = Pool::new(&robot, 2, Priority::Normal).unwrap();
         let library = goal_library(&robot);
         let clips: Vec<_> = (0..3).map(|seed| library.sample(seed, 1.0, 20)).collect();
-        let controller = |filter| {
-            let filter = filters::by_name(filter, &robot).unwrap();
-            Controller::new(Arc::new(policy(&robot)), filter)
-        };
+        let controller =
+            |filter| Controller::by_name(filter, &Arc::new(policy(&robot)), None).unwrap();
         let controllers = ["decoupled", "low-pass:cutoff=3,order=2"].map(controller);
         let rung = |axis, value| Rung { axis, value };
         let rungs = [

@@ -200,8 +200,8 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
         .flatten()
         .flat_map(|clip| clip.windows(200))
         .collect();
-    let filter = emp_models::filters::by_name("velocity-limit:limit=3", &robot)?;
-    let controller = Controller::new(policy::load(&weights)?, filter);
+    let policy = policy::load(&weights)?;
+    let controller = Controller::by_name("velocity-limit:limit=3", &policy, None)?;
     let pool = Pool::new(&robot, 1, Priority::Normal)?;
     let settings = EvaluationSettings {
         seed: 7,

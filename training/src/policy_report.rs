@@ -5,7 +5,7 @@ use std::{path::PathBuf, process::ExitCode, sync::Arc};
 use anyhow::{Context as _, Result};
 use clap::Args;
 use emp_models::{
-    checkpoint::write_atomically, controller::Controller, filters, policy::Policy,
+    checkpoint::write_atomically, controller::Controller, policy::Policy,
     retarget::Retargeter,
 };
 use emp_sim::{
@@ -67,11 +67,11 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         ))
     });
     let policy = Arc::new(Policy::load(&weights, Arc::clone(&robot))?);
-    let controllers = arguments.controllers.iter().map(|name| {
-        let filter = filters::by_name(name, &robot)?;
-        Ok(Controller::new(Arc::clone(&policy), filter))
-    });
-    let controllers = controllers.collect::<Result<Vec<_>>>()?;
+    let controllers = arguments
+        .controllers
+        .iter()
+        .map(|name| Controller::by_name(name, &policy, None));
+    let controllers = controllers.collect::<Result<Vec<_>, _>>()?;
     let clips = clips(arguments, &retargeter)?;
     let pool = Pool::new(&robot, arguments.threads, Priority::Normal)?;
     let mut progress = EpisodeProgress::listen()?;

@@ -1,4 +1,4 @@
-//! Goal filters that need no learning: what every learned filter has to beat.
+//! Goal filters by name: those that need no learning, which every learned filter has to beat, and the EMP.
 //!
 //! A filter is called by a specification: its name, and `:key=value,…` where a parameter is not to have its default, as in
 //! `soft-knee:shoulder_pitch=-1.5,slope=0.6`. [`LIST`] has them all. Whatever a filter does, its goals stay
@@ -20,6 +20,7 @@ use emp_robot::Robot;
 use crate::{
     ModelError,
     controller::{Controller, FilterItem, GoalFilter},
+    emp::{DangerGate, Emp, EmpFilter},
 };
 use low_pass::LowPass;
 use one_euro::OneEuro;
@@ -40,11 +41,21 @@ pub struct FilterDescription {
 }
 
 /// All of them.
-pub const LIST: [FilterDescription; 7] = [
+pub const LIST: [FilterDescription; 9] = [
     FilterDescription {
         name: Controller::DECOUPLED,
         parameters: "",
         summary: "no filter: the goal goes to the robot as it is",
+    },
+    FilterDescription {
+        name: EmpFilter::ALWAYS,
+        parameters: "",
+        summary: "the robot's Executable Motion Prior",
+    },
+    FilterDescription {
+        name: EmpFilter::WHEN_DANGER,
+        parameters: "regloss=<the checkpoint's gate>,tilt=<none>",
+        summary: "the EMP while regloss, or the base's tilt (rad), is above its limit; one limit at most",
     },
     FilterDescription {
         name: VelocityLimit::NAME,
@@ -107,6 +118,14 @@ pub enum FilterError {
         /// What could stand there.
         expected: String,
     },
+    /// The robot has no EMP.
+    #[error("filter {filter}: robot {robot} has no EMP weights")]
+    NoEmp {
+        /// Name of the filter.
+        filter: String,
+        /// Name of the robot.
+        robot: String,
+    },
     /// A parameter has a value that it cannot have.
     #[error("filter {filter}: {key}: expected {expected}, found {found}")]
     Value {
@@ -121,19 +140,27 @@ pub enum FilterError {
     },
 }
 
-/// The filter that `specification` asks for, for `robot`; none for [`Controller::DECOUPLED`].
+/// The filter that `specification` asks for, for `robot` with its EMP, if it has one; none for [`Controller::DECOUPLED`].
 ///
 /// # Errors
-/// If there is no such filter, or a parameter is unknown, malformed or out of its range.
+/// If there is no such filter, it is the EMP and the robot has none, or a parameter is unknown, malformed or out of its range.
 pub fn by_name(
     specification: &str,
     robot: &Arc<Robot>,
+    emp: Option<&Arc<Emp>>,
 ) -> Result<Option<Arc<dyn GoalFilter>>, FilterError> {
     let mut parameters = Parameters::parse(specification)?;
     let rule: Box<dyn Rule> = match parameters.filter() {
         Controller::DECOUPLED => {
             parameters.finish("none")?;
             return Ok(None);
+        }
+        EmpFilter::ALWAYS | EmpFilter::WHEN_DANGER => {
+            let emp = emp.ok_or_else(|| FilterError::NoEmp {
+                filter: parameters.filter().to_owned(),
+                robot: robot.name().to_owned(),
+            })?;
+            return Ok(Some(Arc::new(emp_filter(&mut parameters, emp)?)));
         }
         VelocityLimit::NAME => Box::new(VelocityLimit::new(&mut parameters, robot)?),
         OneEuro::NAME => Box::new(OneEuro::new(&mut parameters, robot)?),
@@ -154,6 +181,23 @@ pub fn by_name(
             .map(|joint| joint.range.map(|limit| limit as f32))
             .collect(),
     })))
+}
+
+fn emp_filter(parameters: &mut Parameters<'_>, emp: &Arc<Emp>) -> Result<EmpFilter, FilterError> {
+    if parameters.filter() == EmpFilter::ALWAYS {
+        parameters.finish("none")?;
+        return Ok(EmpFilter::always(Arc::clone(emp)));
+    }
+    let tilt = parameters.number("tilt", 0.0..=std::f64::consts::PI, " rad")?;
+    let gate = match tilt {
+        Some(tilt) => Some(DangerGate::Tilt(tilt as f32)),
+        None => parameters
+            .number("regloss", 0.0..=1e6, "")?
+            .map(|limit| DangerGate::Regloss(limit as f32)),
+    };
+    parameters.finish("regloss or tilt, not both")?;
+    let gate = gate.unwrap_or(emp.config().gate);
+    Ok(EmpFilter::when_danger(Arc::clone(emp), gate))
 }
 
 /// Changes one robot's goal by a fixed rule.

@@ -22,11 +22,11 @@ fn robots() -> Vec<Arc<Robot>> {
 }
 
 fn filter(robot: &Arc<Robot>, specification: &str) -> Arc<dyn GoalFilter> {
-    by_name(specification, robot).unwrap().unwrap()
+    by_name(specification, robot, None).unwrap().unwrap()
 }
 
 fn refused(specification: &str) -> String {
-    match by_name(specification, &robots()[0]) {
+    match by_name(specification, &robots()[0], None) {
         Ok(_) => panic!("{specification} was accepted"),
         Err(error) => error.to_string(),
     }
@@ -72,6 +72,7 @@ fn run(filter: &dyn GoalFilter, robot: &Robot, goals: &[Vec<f32>]) -> Vec<Vec<f3
             observation: &observation,
             goal: &mut goal,
             memory: &mut memory,
+            risk: &mut None,
         };
         filter.filter(&mut [item]).unwrap();
         goal
@@ -104,7 +105,7 @@ proptest! {
                     (joint.range[0] + f64::from(*share) * (joint.range[1] - joint.range[0])) as f32
                 }).collect()
             }).collect();
-            for filter in &LIST[1..] {
+            for filter in rules() {
                 let answers = run(&*self::filter(&robot, filter.name), &robot, &goals);
                 for (angle, joint) in answers.iter().flat_map(|goal| goal.iter().zip(robot.goal_joints())) {
                     let [lower, upper] = joint.range.map(|limit| limit as f32);
@@ -143,6 +144,7 @@ proptest! {
                     observation: &observation(&robot, tilt[0], tilt[1]),
                     goal: &mut clamped,
                     memory: &mut memory,
+ risk: &mut None,
                 });
                 let rest = rest(&robot);
                 if margin_of(&goal) >= margin + 1e-6 {
@@ -157,18 +159,36 @@ proptest! {
     }
 }
 
+/// The filters that need no learning.
+fn rules() -> impl Iterator<Item = FilterDescription> {
+    let learnt = [
+        Controller::DECOUPLED,
+        EmpFilter::ALWAYS,
+        EmpFilter::WHEN_DANGER,
+    ];
+    LIST.into_iter()
+        .filter(move |filter| !learnt.contains(&filter.name))
+}
+
+#[test]
+fn what_is_no_rule_is_no_filter_or_needs_weights() {
+    let robot = &robots()[0];
+    let none = by_name(Controller::DECOUPLED, robot, None).unwrap();
+    assert!(none.is_none());
+    for name in [EmpFilter::ALWAYS, EmpFilter::WHEN_DANGER] {
+        let message = refused(name);
+        assert!(message.contains("has no EMP weights"), "{message}");
+    }
+}
+
 #[test]
 fn every_filter_of_the_list_has_its_defaults() {
     for robot in robots() {
         let goals = step(&robot, 40);
         for FilterDescription {
             name, parameters, ..
-        } in LIST
+        } in rules()
         {
-            if name == Controller::DECOUPLED {
-                assert!(by_name(name, &robot).unwrap().is_none());
-                continue;
-            }
             let by_default = filter(&robot, name);
             assert_eq!(by_default.name(), name);
             // A parameter in angle brackets has no one number.
@@ -190,7 +210,7 @@ fn every_filter_of_the_list_has_its_defaults() {
 fn what_rests_near_the_default_pose_passes_all_but_the_cut() {
     for robot in robots() {
         let goals = vec![rest(&robot); 10];
-        for filter in &LIST[1..] {
+        for filter in rules() {
             assert_eq!(
                 run(&*self::filter(&robot, filter.name), &robot, &goals),
                 goals
@@ -400,19 +420,22 @@ fn robots_of_a_batch_do_not_mix() {
     let robot = &robots()[0];
     let observation = observation(robot, 0.0, 0.0);
     let goals = [step(robot, 20), vec![pose(robot, &[0.6; 15]); 20]];
-    for description in &LIST[1..] {
+    for description in rules() {
         let filter = filter(robot, description.name);
         let alone = goals.each_ref().map(|goals| run(&*filter, robot, goals));
         let mut memories = [Vec::new(), Vec::new()];
+        let mut risks = [None; 2];
         for t in 0..20 {
             let mut frame = [goals[0][t].clone(), goals[1][t].clone()];
             let mut items: Vec<FilterItem<'_>> = frame
                 .iter_mut()
                 .zip(&mut memories)
-                .map(|(goal, memory)| FilterItem {
+                .zip(&mut risks)
+                .map(|((goal, memory), risk)| FilterItem {
                     observation: &observation,
                     goal,
                     memory,
+                    risk,
                 })
                 .collect();
             filter.filter(&mut items).unwrap();

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use emp_models::{controller::Controller, filters, retarget::Retargeter};
+use emp_models::{controller::Controller, retarget::Retargeter};
 use emp_motion::Clip;
 use emp_proto::v1::{
     EpisodeFinished, EvaluateConfig, EvaluateRequest, EvaluateResponse, EvaluationPreparing,
@@ -278,9 +278,8 @@ fn read_controller(name: &str, policy: &PolicyModel) -> Result<Controller, Field
         "" => Controller::DECOUPLED,
         name => name,
     };
-    let filter = filters::by_name(name, &policy.robot)
-        .map_err(|error| FieldError::new("config.controller", error.to_string()))?;
-    Ok(Controller::new(Arc::clone(policy.model.policy()), filter))
+    Controller::by_name(name, policy.model.policy(), None)
+        .map_err(|error| FieldError::new("config.controller", error.to_string()))
 }
 
 /// Reads motions until the client half-closes.

@@ -2,7 +2,6 @@ use std::cell::Cell;
 use std::sync::Arc;
 
 use emp_models::controller::Controller;
-use emp_models::filters;
 use emp_robot::Robot;
 
 use super::*;
@@ -15,8 +14,7 @@ fn pool(robot: &Robot, threads: usize) -> Pool {
 
 /// A controller whose policy has small random weights: the robot stands for a while.
 fn controller(robot: &Arc<Robot>, filter: &str) -> Controller {
-    let filter = filters::by_name(filter, robot).unwrap();
-    Controller::new(Arc::new(policy(robot)), filter)
+    Controller::by_name(filter, &Arc::new(policy(robot)), None).unwrap()
 }
 
 /// Pieces of swinging arms, the first half as if recorded.
@@ -316,4 +314,70 @@ fn what_cannot_be_run_is_refused_by_name() {
     ] {
         assert!(refused(&good, settings).contains(name), "{name}");
     }
+}
+
+/// Counts frames and keeps what was sent; may stop the arms.
+#[derive(Default)]
+struct Watcher {
+    /// Factor on the goals that are sent; none: they are left alone.
+    factor: Option<f32>,
+    frames: Vec<(usize, usize)>,
+    asked: Vec<f32>,
+    sent: Vec<f32>,
+    readings: Vec<f32>,
+}
+
+impl Observer for Watcher {
+    fn send(&mut self, asked: &[f32], sent: &mut [f32]) {
+        for (sent, asked) in sent.iter_mut().zip(asked) {
+            *sent = self.factor.map_or(*sent, |factor| factor * asked);
+        }
+    }
+
+    fn executed(&mut self, frame: &ExecutedFrame<'_>) {
+        self.frames.push((frame.episode, frame.frame));
+        self.asked.push(frame.asked[0]);
+        self.sent.push(frame.output.goal[0]);
+        self.readings.push(frame.reading.joint_positions[0]);
+    }
+}
+
+#[test]
+fn who_watches_changes_nothing_and_sees_every_frame() {
+    let robot = emp27();
+    let clips = clips(&robot, 5, 40);
+    let controller = controller(&robot, "amplitude-cut:factor=0.5");
+    let settings = hard();
+    let run = |watcher: &mut Watcher| {
+        let pool = pool(&robot, 2);
+        evaluate_observed(&pool, &controller, &clips, &settings, &mut (), watcher).unwrap()
+    };
+    let mut watcher = Watcher::default();
+    let watched = run(&mut watcher);
+    let plain = evaluate(&pool(&robot, 2), &controller, &clips, &settings, &mut ()).unwrap();
+    assert_eq!(watched, plain);
+    let mut seen = watcher.frames.clone();
+    seen.sort_unstable();
+    let expected = plain.results.iter();
+    let expected: Vec<_> = expected
+        .flat_map(|result| (0..result.frames).map(|frame| (result.episode, frame)))
+        .collect();
+    assert_eq!(seen, expected);
+    let halves = watcher.asked.iter().zip(&watcher.sent);
+    assert!(
+        halves
+            .clone()
+            .all(|(asked, sent)| (sent - 0.5 * asked).abs() < 1e-6)
+    );
+    assert!(watcher.asked.iter().any(|angle| angle.abs() > 0.05));
+
+    let mut meddler = Watcher {
+        factor: Some(0.0),
+        ..Watcher::default()
+    };
+    let held = run(&mut meddler);
+    assert!(meddler.sent.iter().all(|&angle| angle == 0.0));
+    let farthest = |readings: &[f32]| readings.iter().fold(0.0_f32, |most, q| most.max(q.abs()));
+    assert_ne!(held.results, plain.results);
+    assert!(farthest(&meddler.readings) < farthest(&watcher.readings));
 }

@@ -105,7 +105,9 @@ mod tests {
             history.set_last_action(&action);
         }
         let mut features = Vec::new();
-        config.map_history(history.stack(), &mut features);
+        config
+            .history_map
+            .apply(&config.observation, history.stack(), &mut features);
         features
     }
 

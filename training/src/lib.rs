@@ -3,6 +3,7 @@
 //! This crate makes the weights that the other crates serve. It never serves, and no crate but the end-to-end tests depends on it.
 #![forbid(unsafe_code)]
 
+pub mod emp;
 pub mod log;
 pub mod policy;
 pub mod retargeter;

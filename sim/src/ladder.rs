@@ -227,7 +227,6 @@ impl fmt::Display for Ladder {
 mod tests {
     use std::sync::Arc;
 
-    use emp_models::filters;
 
     use super::*;
     use crate::Priority;

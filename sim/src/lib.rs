@@ -38,6 +38,7 @@ pub mod metrics;
 mod physics;
 mod pool;
 mod skeleton;
+pub mod suite;
 #[cfg(test)]
 mod testing;
 

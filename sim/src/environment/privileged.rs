@@ -165,8 +165,6 @@ impl PrivilegedLayout {
         let reading = state.reading;
         let [_, _, yaw] = roll_pitch_yaw(&reading.orientation);
         let to_heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw);
-        let middle = (reading.feet[0].position + reading.feet[1].position) / 2.0;
-        let com = to_heading * (reading.center_of_mass - middle);
         let forces = reading.feet.iter().map(|foot| foot.force);
 
         out[self.frame.clone()].copy_from_slice(state.frame);
@@ -195,7 +193,7 @@ impl PrivilegedLayout {
         }
         write(
             &mut out[self.center_of_mass.clone()],
-            &com.xy(),
+            &reading.center_of_mass_over_feet(),
             CENTER_OF_MASS,
         );
         out[self.action_before.clone()].copy_from_slice(state.action_before);

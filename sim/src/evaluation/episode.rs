@@ -9,6 +9,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::observer::ExecutedFrame;
 use super::settings::Pushes;
 use crate::environment::{EndReason, EnvironmentConfig, Randomization, leg_targets, within};
 use crate::goals::{GoalClip, Source};
@@ -119,9 +120,14 @@ impl<'a> Episode<'a> {
                 joint_positions: &reading.joint_positions,
                 orientation: reading.orientation,
             },
-            goal: self.clip.frame(self.executed),
+            goal: self.asked(),
         };
         (&mut self.state, input)
+    }
+
+    /// The goal of the control period to come; of an episode that is over, the clip's last.
+    pub(super) fn asked(&self) -> &'a [f32] {
+        self.clip.frame(self.executed)
     }
 
     /// One control period with the controller's answer.
@@ -137,6 +143,7 @@ impl<'a> Episode<'a> {
             ),
             None => self.legs.copy_from_slice(&output.leg_targets),
         }
+        let asked = self.asked();
         let goals = output.goal.len();
         let speeds_before = self.body.reading().joint_velocities[..goals].to_vec();
         let targets = Targets {
@@ -150,7 +157,7 @@ impl<'a> Episode<'a> {
         if reading.divergence.is_none() {
             self.sums.add(&Frame {
                 reading,
-                goal: self.clip.frame(self.executed),
+                goal: asked,
                 speeds_before: &speeds_before,
             });
         }
@@ -158,6 +165,18 @@ impl<'a> Episode<'a> {
         if fall.is_some() || self.executed == self.clip.len() {
             self.sums.sums.suc = f64::from(u8::from(fall.is_none()));
             self.outcome = Some(fall);
+        }
+    }
+
+    /// The control period that was executed last, with the controller's answer.
+    pub(super) fn executed<'b>(&'b self, output: &'b ControllerOutput) -> ExecutedFrame<'b> {
+        let frame = self.executed - 1;
+        ExecutedFrame {
+            episode: self.number,
+            frame,
+            asked: self.clip.frame(frame),
+            output,
+            reading: self.body.reading(),
         }
     }
 

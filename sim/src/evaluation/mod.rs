@@ -6,6 +6,7 @@
 //! the same bits on any number of threads.
 
 mod episode;
+mod observer;
 mod settings;
 #[cfg(test)]
 mod tests;
@@ -18,6 +19,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 pub use episode::EpisodeResult;
+pub use observer::{ExecutedFrame, Observer};
 pub use settings::{Conditions, EvaluationSettings, Kick};
 
 use crate::environment::EnvironmentConfig;
@@ -146,6 +148,21 @@ pub fn evaluate(
     settings: &EvaluationSettings,
     progress: &mut dyn Progress,
 ) -> Result<Evaluation, SimError> {
+    evaluate_observed(pool, controller, clips, settings, progress, &mut ())
+}
+
+/// As [`evaluate`], with somebody who watches every control period. One who changes nothing leaves every bit as it is.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn evaluate_observed(
+    pool: &Pool,
+    controller: &Controller,
+    clips: &[GoalClip],
+    settings: &EvaluationSettings,
+    progress: &mut dyn Progress,
+    observer: &mut dyn Observer,
+) -> Result<Evaluation, SimError> {
     let robot = controller.policy().robot();
     settings.check(robot)?;
     check_clips(clips, robot.goal_joints().len())?;
@@ -172,7 +189,7 @@ pub fn evaluate(
     let mut results = Vec::with_capacity(episodes);
     for start in (0..episodes).step_by(GROUP) {
         let group = start..(start + GROUP).min(episodes);
-        runner.run(group, progress, &mut results)?;
+        runner.run(group, progress, observer, &mut results)?;
     }
     results.sort_unstable_by_key(|result| result.episode);
     let scores = |source: Option<Source>| runner.scores(&results, source);
@@ -227,6 +244,7 @@ impl<'a> Runner<'a> {
         &self,
         group: Range<usize>,
         progress: &mut dyn Progress,
+        observer: &mut dyn Observer,
         results: &mut Vec<EpisodeResult>,
     ) -> Result<(), SimError> {
         if progress.is_cancelled() {
@@ -235,18 +253,26 @@ impl<'a> Runner<'a> {
         let mut episodes = self.place(group);
         while !episodes.iter().all(Episode::is_over) && !progress.is_cancelled() {
             let mut batch: Vec<_> = episodes.iter_mut().map(Episode::input).collect();
-            let outputs = self.controller.step(&mut batch)?;
+            let mut outputs = self.controller.step(&mut batch)?;
             let was_over: Vec<bool> = episodes.iter().map(Episode::is_over).collect();
+            for (episode, output) in episodes.iter().zip(&mut outputs) {
+                observer.send(episode.asked(), &mut output.goal);
+            }
             let pairs = episodes.par_iter_mut().zip(&outputs);
             self.pool.for_each(pairs, |stage, (episode, output)| {
                 if !episode.is_over() {
                     episode.step(&self.setting, stage, output);
                 }
             });
-            let ended = episodes.iter().zip(was_over).filter(|(_, over)| !over);
-            for result in ended.filter_map(|(episode, _)| episode.result()) {
-                progress.finished(&result);
-                results.push(result);
+            for ((episode, output), was_over) in episodes.iter().zip(&outputs).zip(was_over) {
+                if was_over {
+                    continue;
+                }
+                observer.executed(&episode.executed(output));
+                if let Some(result) = episode.result() {
+                    progress.finished(&result);
+                    results.push(result);
+                }
             }
         }
         Ok(())

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use emp_models::observation::roll_pitch_yaw;
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::fields::ModelFields;
@@ -79,6 +80,17 @@ pub struct Reading {
     pub self_contact: SelfContact,
     /// Set if the simulation diverged in this control period: then all else is as it was before it.
     pub divergence: Option<Divergence>,
+}
+
+impl Reading {
+    /// Horizontal way from the middle between the soles to the centre of mass, in the base's heading frame: x forward,
+    /// y left, metres.
+    pub fn center_of_mass_over_feet(&self) -> Vector2<f64> {
+        let [_, _, yaw] = roll_pitch_yaw(&self.orientation);
+        let to_heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw);
+        let middle = (self.feet[0].position + self.feet[1].position) / 2.0;
+        (to_heading * (self.center_of_mass - middle)).xy()
+    }
 }
 
 /// What was measured of one foot.

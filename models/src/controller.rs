@@ -58,6 +58,14 @@ pub struct ControllerState {
 }
 
 impl ControllerState {
+    /// A robot without a past, seen through `layout`.
+    pub fn new(layout: ObservationLayout) -> Self {
+        Self {
+            history: History::new(layout),
+            filter_memory: Vec::new(),
+        }
+    }
+
     /// Forgets everything: the next step is the first of an episode.
     pub fn reset(&mut self) {
         self.history.reset();
@@ -72,6 +80,11 @@ impl ControllerState {
     /// The last frames, to put an episode's past in.
     pub fn history_mut(&mut self) -> &mut History {
         &mut self.history
+    }
+
+    /// Puts what a filter remembers in, for an episode that goes on.
+    pub fn set_filter_memory(&mut self, memory: Vec<f32>) {
+        self.filter_memory = memory;
     }
 }
 
@@ -95,6 +108,81 @@ pub struct ControllerOutput {
     pub leg_targets: Vec<f32>,
     /// How dangerous the filter finds the goal; none without an EMP.
     pub risk: Option<Risk>,
+}
+
+/// A goal that went through a filter.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FilteredGoal {
+    /// The goal to execute: angles of the goal joints, rad.
+    pub goal: Vec<f32>,
+    /// How dangerous the filter finds the goal that was asked for; none without an EMP.
+    pub risk: Option<Risk>,
+}
+
+/// A controller up to its policy: adds a control period to each robot's history and puts its goal through a filter. The
+/// newest frame of a history then holds the goal to execute (erratum E9).
+///
+/// # Errors
+/// [`ModelError::Frame`] if an input has another number of joints than `layout`, before any state has changed; when a model
+/// fails.
+pub fn filter_goals(
+    layout: &ObservationLayout,
+    filter: Option<&dyn GoalFilter>,
+    batch: &mut [(&mut ControllerState, ControllerInput<'_>)],
+) -> Result<Vec<FilteredGoal>, ModelError> {
+    for (index, (_, input)) in batch.iter().enumerate() {
+        check(layout, index, input)?;
+    }
+    for (robot, input) in batch.iter_mut() {
+        robot.history.push(&input.state, input.goal);
+    }
+    let asked = batch.iter().map(|(_, input)| FilteredGoal {
+        goal: input.goal.to_vec(),
+        risk: None,
+    });
+    let mut goals: Vec<FilteredGoal> = asked.collect();
+    let Some(filter) = filter else {
+        return Ok(goals);
+    };
+    let robots = batch.iter_mut().zip(&mut goals);
+    let mut items: Vec<FilterItem<'_>> = robots
+        .map(|((robot, _), FilteredGoal { goal, risk })| FilterItem {
+            observation: robot.history.stack(),
+            goal,
+            memory: &mut robot.filter_memory,
+            risk,
+        })
+        .collect();
+    filter.filter(&mut items)?;
+    for ((robot, _), filtered) in batch.iter_mut().zip(&goals) {
+        robot.history.set_newest_goal(&filtered.goal);
+    }
+    Ok(goals)
+}
+
+fn check(
+    layout: &ObservationLayout,
+    index: usize,
+    input: &ControllerInput<'_>,
+) -> Result<(), ModelError> {
+    let widths = [
+        (
+            "joint positions",
+            input.state.joint_positions.len(),
+            layout.joint_positions().len(),
+        ),
+        ("goal angles", input.goal.len(), layout.goal().len()),
+    ];
+    match widths
+        .into_iter()
+        .find(|(_, found, expected)| found != expected)
+    {
+        Some((what, found, expected)) => Err(ModelError::Frame {
+            index,
+            reason: format!("{found} {what}, expected {expected}"),
+        }),
+        None => Ok(()),
+    }
 }
 
 /// A policy with an optional goal filter before it.
@@ -140,10 +228,7 @@ impl Controller {
 
     /// A robot without a past.
     pub fn state(&self) -> ControllerState {
-        ControllerState {
-            history: History::new(*self.layout()),
-            filter_memory: Vec::new(),
-        }
+        ControllerState::new(*self.layout())
     }
 
     fn layout(&self) -> &ObservationLayout {
@@ -159,39 +244,17 @@ impl Controller {
         &self,
         batch: &mut [(&mut ControllerState, ControllerInput<'_>)],
     ) -> Result<Vec<ControllerOutput>, ModelError> {
-        for (index, (_, input)) in batch.iter().enumerate() {
-            self.check(index, input)?;
-        }
-        for (robot, input) in batch.iter_mut() {
-            robot.history.push(&input.state, input.goal);
-        }
-        let mut goals: Vec<Vec<f32>> = batch.iter().map(|(_, input)| input.goal.to_vec()).collect();
-        let mut risks = vec![None; batch.len()];
-        if let Some(filter) = &self.filter {
-            let robots = batch.iter_mut().zip(&mut goals).zip(&mut risks);
-            let mut items: Vec<FilterItem<'_>> = robots
-                .map(|(((robot, _), goal), risk)| FilterItem {
-                    observation: robot.history.stack(),
-                    goal,
-                    memory: &mut robot.filter_memory,
-                    risk,
-                })
-                .collect();
-            filter.filter(&mut items)?;
-            for ((robot, _), goal) in batch.iter_mut().zip(&goals) {
-                robot.history.set_newest_goal(goal);
-            }
-        }
+        let goals = filter_goals(self.layout(), self.filter.as_deref(), batch)?;
         let mut observations = Vec::with_capacity(batch.len() * self.layout().width());
         for (robot, _) in batch.iter() {
             observations.extend_from_slice(robot.history.stack());
         }
         let actions = self.policy.actions(&observations)?;
         let legs = self.layout().last_action().len();
-        let answers = batch.iter_mut().zip(goals).zip(risks);
+        let answers = batch.iter_mut().zip(goals);
         Ok(answers
             .zip(actions.chunks_exact(legs))
-            .map(|((((robot, _), goal), risk), action)| {
+            .map(|(((robot, _), FilteredGoal { goal, risk }), action)| {
                 robot.history.set_last_action(action);
                 ControllerOutput {
                     goal,
@@ -201,27 +264,5 @@ impl Controller {
                 }
             })
             .collect())
-    }
-
-    fn check(&self, index: usize, input: &ControllerInput<'_>) -> Result<(), ModelError> {
-        let layout = self.layout();
-        let widths = [
-            (
-                "joint positions",
-                input.state.joint_positions.len(),
-                layout.joint_positions().len(),
-            ),
-            ("goal angles", input.goal.len(), layout.goal().len()),
-        ];
-        match widths
-            .into_iter()
-            .find(|(_, found, expected)| found != expected)
-        {
-            Some((what, found, expected)) => Err(ModelError::Frame {
-                index,
-                reason: format!("{found} {what}, expected {expected}"),
-            }),
-            None => Ok(()),
-        }
     }
 }

@@ -6,11 +6,13 @@
 #![forbid(unsafe_code)]
 
 pub mod activation;
+pub mod assessment;
 pub mod checkpoint;
 pub mod controller;
 pub mod emp;
 pub mod error;
 pub mod filters;
+pub mod guard;
 pub mod kinematics;
 pub mod linear;
 pub mod observation;

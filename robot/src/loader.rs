@@ -239,6 +239,7 @@ impl Loader<'_> {
                 self.sole("contacts.left_foot", &feet[0], base)?,
                 self.sole("contacts.right_foot", &feet[1], base)?,
             ],
+            foot_contacts: self.foot_contacts(feet, base)?,
         })
     }
 
@@ -280,6 +281,26 @@ impl Loader<'_> {
     ) -> Result<(usize, Vector3<f64>), RobotError> {
         let body = self.robot_body(format!("{key}.body"), &foot.body, base)?;
         Ok((body, Vector3::from(foot.sole_center())))
+    }
+
+    fn foot_contacts(
+        &self,
+        feet: &[Foot; 2],
+        base: usize,
+    ) -> Result<Vec<(usize, Vector3<f64>)>, RobotError> {
+        let mut contacts = Vec::new();
+        for (key, foot) in ["contacts.left_foot", "contacts.right_foot"]
+            .into_iter()
+            .zip(feet)
+        {
+            let body = self.robot_body(format!("{key}.body"), &foot.body, base)?;
+            contacts.extend(
+                foot.centers
+                    .iter()
+                    .map(|&center| (body, Vector3::from(center))),
+            );
+        }
+        Ok(contacts)
     }
 
     /// A body of the robot: the base or one below it.

@@ -1,6 +1,5 @@
-//! The area on which the robot stands in its default pose.
+//! The area on which a robot stands.
 
-use mujoco_rs::prelude::*;
 use nalgebra::Vector2;
 
 use crate::Robot;
@@ -13,16 +12,15 @@ pub struct SupportPolygon {
 }
 
 impl SupportPolygon {
-    /// The convex hull of points.
-    fn hull(mut points: Vec<Vector2<f64>>) -> Self {
+    /// The convex hull of points, metres.
+    pub fn hull(mut points: Vec<Vector2<f64>>) -> Self {
         points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
         let mut vertices = half_hull(points.iter());
         vertices.extend(half_hull(points.iter().rev()));
         Self { vertices }
     }
 
-    /// Its corners, counter-clockwise; x forward, y left, origin midway between the centres of the two soles (where
-    /// [`OutputLayout::foot_support`](crate::OutputLayout::foot_support) is), metres.
+    /// Its corners, counter-clockwise, in the frame of the points that it is the hull of, metres.
     pub fn vertices(&self) -> &[Vector2<f64>] {
         &self.vertices
     }
@@ -41,23 +39,13 @@ impl SupportPolygon {
 }
 
 impl Robot {
-    /// The convex hull of the points where both feet touch the floor in the default pose.
+    /// The convex hull of the points where both feet touch the floor in the default pose; x forward, y left, origin midway
+    /// between the centres of the two soles (where [`OutputLayout::foot_support`](crate::OutputLayout::foot_support) is).
     pub fn support_polygon(&self) -> SupportPolygon {
-        let model = self.model();
-        let mut data = model.make_data();
-        let qpos = data.qpos_mut();
-        qpos.fill(0.0);
-        qpos[3] = 1.0;
-        for joint in self.joints() {
-            qpos[joint.qpos_address] = joint.default;
-        }
-        data.kinematics();
-        let geoms = self.feet().iter().flat_map(|foot| &foot.geoms);
-        let points = geoms
-            .filter_map(|geom| model.name_to_id(MjtObjBase::mjOBJ_GEOM, geom))
-            .map(|geom| Vector2::new(data.geom_xpos()[geom][0], data.geom_xpos()[geom][1]));
+        let q: Vec<f64> = self.joints().map(|joint| joint.default).collect();
         let center = self.default_support();
-        SupportPolygon::hull(points.map(|point| point - center).collect())
+        let contacts = self.kinematics().foot_contacts(&q);
+        SupportPolygon::hull(contacts.iter().map(|point| point.xy() - center).collect())
     }
 
     /// Midway between the centres of the soles in the default pose, in the base's frame.

@@ -138,6 +138,37 @@ fn forward_equals_mujoco() {
 }
 
 /// The scalar whose gradient with respect to the outputs is `weights`.
+#[test]
+fn foot_contacts_are_where_mujoco_has_them() {
+    for robot in common::all() {
+        let reference = Reference::new(&robot);
+        let q = common::random_poses(&robot, &mut common::seeded(7), 1);
+        let data = reference.pose(&robot, &q);
+        let geoms = robot.feet().iter().flat_map(|foot| &foot.geoms);
+        let expected = geoms.map(|geom| {
+            let id = reference.model.name_to_id(MjtObjBase::mjOBJ_GEOM, geom);
+            Vector3::from(data.geom_xpos()[id.expect("the geom is there")])
+        });
+        let found = robot.kinematics().foot_contacts(&q);
+        let spheres = robot.feet().iter().map(|foot| foot.centers.len());
+        assert_eq!(found.len(), spheres.sum::<usize>());
+        let base = reference.body(&data, robot.base_body());
+        for (found, expected) in found.iter().zip(expected) {
+            assert!((found + base.position - expected).norm() < 1e-9);
+        }
+    }
+}
+
+#[test]
+fn goals_move_what_hangs_on_the_waist() {
+    let robot = &common::all()[0];
+    let moved: Vec<&str> = (0..robot.link_spheres().len())
+        .filter(|&link| robot.kinematics().goals_move(link))
+        .map(|link| robot.link_spheres()[link].name.as_str())
+        .collect();
+    assert_eq!(moved, ["torso", "left_hand", "right_hand"]);
+}
+
 fn weighted(kinematics: &Kinematics, q: &[f64], weights: &[f64]) -> f64 {
     forward(kinematics, q)
         .iter()

@@ -32,7 +32,7 @@ impl<T: Real> Pose<T> {
     }
 
     #[inline(always)]
-    fn point(&self, offset: [T; 3]) -> Vec3<T> {
+    pub(super) fn point(&self, offset: [T; 3]) -> Vec3<T> {
         sum(self.origin, self.rotate(offset))
     }
 

@@ -12,6 +12,7 @@ mod tree;
 use std::ops::Range;
 
 use mujoco_rs::prelude::*;
+use nalgebra::Vector3;
 
 pub use frame::FrameKinematics;
 pub use real::Real;
@@ -142,6 +143,34 @@ impl Kinematics {
             tree.poses(q, &mut poses);
             tree.pull(&poses, KEY_NODES, grad_out, &mut wrenches, grad_q);
         }
+    }
+
+    /// Centres of the spheres with which both feet touch the floor, the left foot's first, at one joint vector `q`.
+    ///
+    /// # Panics
+    /// If `q` is not one angle for each joint.
+    pub fn foot_contacts(&self, q: &[f64]) -> Vec<Vector3<f64>> {
+        assert_eq!(q.len(), self.dof(), "one angle for each joint");
+        let mut poses = vec![Pose::base(); self.double.nodes.len()];
+        self.double.poses(q, &mut poses);
+        let contacts = self.double.foot_contacts.iter();
+        contacts
+            .map(|contact| poses[contact.node].point(contact.offset))
+            .map(|point| point.map(|lane| lane.0[0]).into())
+            .collect()
+    }
+
+    /// Whether a goal joint moves the link sphere with this index.
+    pub fn goals_move(&self, link: usize) -> bool {
+        let nodes = &self.double.nodes;
+        let mut node = self.double.points[KEY_NODES + link].node;
+        while node != 0 {
+            if nodes[node].joint < self.goal_joints {
+                return true;
+            }
+            node = nodes[node].parent;
+        }
+        false
     }
 
     /// A state for following one pose at a time, as inverse kinematics does; every joint at zero.

@@ -75,6 +75,8 @@ pub struct Tree<T> {
     pub(super) wrists: [Frame<T>; 2],
     /// Centres of the soles, left and right.
     pub(super) soles: [Point<T>; 2],
+    /// Centres of the spheres that touch the floor, both feet's.
+    pub(super) foot_contacts: Vec<Point<T>>,
 }
 
 /// What is attached to the bodies of a model, in the frames of those bodies (given by their ids).
@@ -84,6 +86,7 @@ pub(crate) struct Attached {
     /// Columns x, y, z.
     pub(crate) wrists: [(usize, Matrix3<f64>); 2],
     pub(crate) soles: [(usize, Vector3<f64>); 2],
+    pub(crate) foot_contacts: Vec<(usize, Vector3<f64>)>,
 }
 
 /// A body in the pose where every joint is zero, in the base's frame, and the node that carries it.
@@ -136,6 +139,7 @@ impl Tree<f64> {
             points: self.points.iter().map(Point::cast).collect(),
             wrists: self.wrists.map(|wrist| wrist.cast()),
             soles: self.soles.map(|sole| sole.cast()),
+            foot_contacts: self.foot_contacts.iter().map(Point::cast).collect(),
         }
     }
 }
@@ -215,6 +219,7 @@ impl<'a> Builder<'a> {
                 .collect(),
             wrists: attached.wrists.each_ref().map(frame),
             soles: attached.soles.each_ref().map(point),
+            foot_contacts: attached.foot_contacts.iter().map(point).collect(),
             nodes: self.nodes,
         }
     }

@@ -131,7 +131,7 @@ impl Normalizer {
     ///
     /// # Errors
     /// Says which tensor is missing or wrong.
-    pub(crate) fn from_tensors(tensors: &Tensors, features: usize) -> Result<Self, String> {
+    pub fn from_tensors(tensors: &Tensors, features: usize) -> Result<Self, String> {
         let read = |name: &str| {
             let tensor = tensors.get(name).ok_or(format!("no tensor `{name}`"))?;
             let values = tensor

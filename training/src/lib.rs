@@ -7,5 +7,6 @@ pub mod emp;
 pub mod log;
 pub mod policy;
 pub mod retargeter;
+mod rows;
 pub mod run;
 pub mod variables;

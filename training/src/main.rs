@@ -1,6 +1,9 @@
 //! `emp-train`: trains the models and reports on them.
 
+mod fall_report;
 mod policy_report;
+mod train_emp;
+mod trial;
 
 use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
 
@@ -52,6 +55,11 @@ enum Command {
     /// Procedural skills are always in the mix; recorded motion comes from --motions, retargeted by the robot's retargeter.
     /// The run's checkpoint and CSV log stand in runs/policy-ROBOT; Ctrl-C saves, --resume continues bit for bit.
     Policy(PolicyArguments),
+    /// Train an Executable Motion Prior on a robot's frozen policy (paper, section V).
+    ///
+    /// Procedural skills are always in the mix; recorded motion comes from --motions. The run's checkpoint and CSV logs stand in
+    /// runs/emp-ROBOT; Ctrl-C saves, --resume continues bit for bit.
+    Emp(train_emp::Arguments),
     /// Draw the learning curves of policies.
     PolicyCurves(CurvesArguments),
     /// Score a trained policy, bare and behind goal filters: held-out clips, larger amplitude, full randomisation.
@@ -59,6 +67,10 @@ enum Command {
     /// Recorded motion comes from --motions and should be of people that were not trained on; procedural skills come from a
     /// seed of their own.
     PolicyReport(policy_report::Arguments),
+    /// Find out what fells a policy under hard conditions: joints, directions, poses, and how early it shows.
+    ///
+    /// Motion as for policy-report. Prints a page in Markdown.
+    FallReport(fall_report::Arguments),
     /// Compare a trained retargeter with converged inverse kinematics on the same objective.
     RetargetReport(ReportArguments),
 }
@@ -207,7 +219,9 @@ fn main() -> Result<ExitCode> {
             policy::curves::draw(&arguments.log, &arguments.out)?;
             Ok(ExitCode::SUCCESS)
         }
+        Command::Emp(arguments) => train_emp::run(&arguments),
         Command::PolicyReport(arguments) => policy_report::run(&arguments),
+        Command::FallReport(arguments) => fall_report::run(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),
     }
 }
@@ -425,4 +439,12 @@ fn report_retargeter(arguments: &ReportArguments) -> Result<ExitCode> {
         print!("{report}");
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// A robot's policy weights: as given, or the shipped ones.
+fn policy_weights(given: Option<&PathBuf>, robot: &Robot) -> PathBuf {
+    given.cloned().unwrap_or_else(|| {
+        let name = robot.name();
+        PathBuf::from(format!("models/weights/{name}-policy.safetensors"))
+    })
 }

@@ -26,12 +26,7 @@ pub fn retarget_clips(
     threads: usize,
 ) -> Result<Vec<GoalRows>, ModelError> {
     for clip in clips {
-        clip.validate()
-            .map_err(|(frame, reason)| ModelError::Clip {
-                clip: clip.name.clone(),
-                frame,
-                reason: reason.to_string(),
-            })?;
+        check(clip)?;
     }
     let next = AtomicUsize::new(0);
     let work = || -> Vec<(usize, Result<GoalRows, ModelError>)> {
@@ -57,6 +52,32 @@ pub fn retarget_clips(
     });
     answers.sort_unstable_by_key(|(index, _)| *index);
     answers.into_iter().map(|(_, answer)| answer).collect()
+}
+
+/// The network's own answers to a clip of any frame rate, at the robot's control rate: what a live stream without refinement
+/// and smoothing gives, jumps between codes included.
+///
+/// # Errors
+/// [`ModelError::Clip`] for a frame that is no pose; when the tensor library fails.
+pub fn predict_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {
+    check(clip)?;
+    let clip = clip.resampled(retargeter.robot().control_rate_hz());
+    let joints = retargeter.robot().goal_joints().len();
+    let mut rows = GoalRows::with_capacity(clip.frames.len());
+    for frames in clip.frames.chunks(BATCH) {
+        let targets: Vec<Target> = frames.iter().map(Target::new).collect();
+        let (answers, _) = retargeter.predict(&targets)?;
+        rows.extend(answers.chunks(joints).map(<[f32]>::to_vec));
+    }
+    Ok(rows)
+}
+
+fn check(clip: &Clip) -> Result<(), ModelError> {
+    clip.validate().map_err(|(frame, reason)| ModelError::Clip {
+        clip: clip.name.clone(),
+        frame,
+        reason: reason.to_string(),
+    })
 }
 
 fn retarget_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {

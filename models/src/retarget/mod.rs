@@ -15,7 +15,7 @@ use emp_robot::Robot;
 use nalgebra::Vector3;
 
 pub use self::{
-    clips::{GoalRows, retarget_clips},
+    clips::{GoalRows, predict_clip, retarget_clips},
     features::{BONES, Target, features},
     network::{NetworkConfig, RetargetNetwork},
     objective::{Effort, Solver},

@@ -1,6 +1,6 @@
 //! Goal-joint angles over time.
 
-use emp_models::retarget::{Retargeter, retarget_clips};
+use emp_models::retarget::{Retargeter, predict_clip, retarget_clips};
 use emp_motion::Clip;
 use emp_robot::{JointMirror, Robot};
 use serde::{Deserialize, Serialize};
@@ -101,6 +101,19 @@ impl GoalClip {
         clips
             .map(|(clip, rows)| Self::new(retargeter.robot(), &clip.name, source, &rows))
             .collect()
+    }
+
+    /// What `retargeter` makes of one clip of human motion without refinement and smoothing, as a live stream may.
+    ///
+    /// # Errors
+    /// If a frame of `motion` is no pose, or the network fails.
+    pub fn retargeted_live(
+        retargeter: &Retargeter,
+        motion: &Clip,
+        source: Source,
+    ) -> Result<Self, GoalError> {
+        let rows = predict_clip(retargeter, motion)?;
+        Self::new(retargeter.robot(), &motion.name, source, &rows)
     }
 
     /// Number of frames, at least 1.

@@ -161,6 +161,12 @@ pub fn centroid(
     exponents.exp()?.minimum(CENTROID_BOUND)? - 1.0
 }
 
+/// `L_cen` of one distance, m.
+pub fn centroid_of(distance: f64) -> f64 {
+    let exponent = CENTROID_SLOPE * (distance - CENTROID_DISTANCE);
+    exponent.exp().min(CENTROID_BOUND) - 1.0
+}
+
 /// `L_smo = ‖x_t − x_{t−1}‖² + 0.2 ‖x_t + x_{t−2} − 2 x_{t−1}‖²` (N) of three successive rows (N × goal joints, rad).
 ///
 /// # Errors

@@ -1,5 +1,12 @@
 //! The Executable Motion Prior: learning to change goals only as far as balance needs (paper, section V).
 
+pub mod data;
+pub mod falls;
 pub mod imagination;
+pub mod judge;
+pub mod learner;
 pub mod losses;
 pub mod objective;
+pub mod rollout;
+pub mod settings;
+pub mod trainer;

@@ -26,7 +26,10 @@ use super::{
     settings::{PpoSettings, Symmetry},
     symmetry::FeatureMirror,
 };
-use crate::variables;
+use crate::{
+    rows::{self, gather, gathered, tensor},
+    variables,
+};
 
 /// Rows of a forward pass without gradient.
 const ROWS: usize = 1024;
@@ -244,8 +247,8 @@ impl Learner {
         };
         Ok(Batch {
             log_probabilities: self.log_probabilities(rollout, &log_std)?,
-            explained_variance: explained_variance(&returns, &advantages),
-            advantages: standardized(&advantages),
+            explained_variance: returns::explained_variance(&returns, &advantages),
+            advantages: returns::standardized(&advantages),
             returns,
             privileged: normalized(&rollout.privileged, &normalizer),
             mirrored: self.mirrored(rollout),
@@ -334,12 +337,17 @@ impl Learner {
         })?;
         let divergence: f64 = shards.iter().map(|shard| shard.divergence).sum();
         let rate = &mut self.progress.learning_rate;
-        *rate =
-            objective::adapted_learning_rate(*rate, divergence / rows.len() as f64, &self.settings);
+        *rate = objective::adapted_learning_rate(
+            *rate,
+            divergence / rows.len() as f64,
+            self.settings.target_divergence,
+            self.settings.learning_rate,
+        );
         sums.divergence += divergence;
         sums.policy += shards.iter().map(|shard| shard.policy).sum::<f64>();
         sums.value += shards.iter().map(|shard| shard.value).sum::<f64>();
-        let gradient = self.add(shards.into_iter().map(|shard| shard.gradient))?;
+        let gradients = shards.into_iter().map(|shard| shard.gradient);
+        let gradient = rows::add_gradients(gradients, &[self.network.vars()])?;
         sums.gradient_norm += self.adam.step(&gradient, self.progress.learning_rate)?;
         self.network.bound_std(self.settings.min_std)?;
         Ok(())
@@ -353,8 +361,10 @@ impl Learner {
             _ => &batch.original,
         };
         let samples = self.samples(batch, view, rows)?;
-        let means = self.network.means(&samples.features)?;
-        let values = self.network.values(&samples.privileged)?;
+        let features = gathered(&view.features, self.widths.features, rows)?;
+        let privileged = gathered(&batch.privileged, self.widths.privileged, rows)?;
+        let means = self.network.means(&features)?;
+        let values = self.network.values(&privileged)?;
         let log_std = self.network.log_std();
         let losses = Losses::new(&samples, &means, log_std, &values, settings.clip)?;
         let mut loss = losses.total(settings)?;
@@ -387,28 +397,11 @@ impl Learner {
         let column =
             |values: &[f32]| Tensor::from_vec(gather(values, 1, rows), rows.len(), &Device::Cpu);
         Ok(Samples {
-            features: gathered(&view.features, self.widths.features, rows)?,
-            privileged: gathered(&batch.privileged, self.widths.privileged, rows)?,
             actions: gathered(&view.actions, self.widths.actions, rows)?,
             log_probabilities: column(&batch.log_probabilities)?,
             advantages: column(&batch.advantages)?,
             returns: column(&batch.returns)?,
         })
-    }
-
-    /// Adds gradients in order.
-    fn add(&self, gradients: impl Iterator<Item = GradStore>) -> Result<GradStore> {
-        let mut gradients = gradients;
-        let mut total = gradients.next().context("a mini-batch has no rows")?;
-        let vars = variables::lock(self.network.vars())?;
-        for gradient in gradients {
-            for var in vars.values() {
-                if let (Some(sum), Some(part)) = (total.remove(var), gradient.get(var)) {
-                    total.insert(var, (sum + part)?);
-                }
-            }
-        }
-        Ok(total)
     }
 }
 
@@ -450,51 +443,10 @@ struct Sums {
     gradient_norm: f64,
 }
 
-fn tensor(rows: &[f32], width: usize) -> candle_core::Result<Tensor> {
-    Tensor::from_slice(rows, (rows.len() / width, width), &Device::Cpu)
-}
-
-fn gather(values: &[f32], width: usize, rows: &[usize]) -> Vec<f32> {
-    let mut gathered = Vec::with_capacity(rows.len() * width);
-    for row in rows {
-        gathered.extend_from_slice(&values[row * width..(row + 1) * width]);
-    }
-    gathered
-}
-
-fn gathered(values: &[f32], width: usize, rows: &[usize]) -> candle_core::Result<Tensor> {
-    Tensor::from_vec(
-        gather(values, width, rows),
-        (rows.len(), width),
-        &Device::Cpu,
-    )
-}
-
 fn normalized(rows: &[f32], normalizer: &Normalizer) -> Vec<f32> {
     let mut rows = rows.to_vec();
     normalizer.apply(&mut rows);
     rows
-}
-
-fn mean_and_variance(values: &[f32]) -> (f64, f64) {
-    let count = values.len().max(1) as f64;
-    let mean = values.iter().map(|x| f64::from(*x)).sum::<f64>() / count;
-    let squares = values.iter().map(|x| (f64::from(*x) - mean).powi(2));
-    (mean, squares.sum::<f64>() / count)
-}
-
-fn standardized(values: &[f32]) -> Vec<f32> {
-    let (mean, variance) = mean_and_variance(values);
-    let scale = 1.0 / (variance.sqrt() + 1e-8);
-    values
-        .iter()
-        .map(|x| ((f64::from(*x) - mean) * scale) as f32)
-        .collect()
-}
-
-/// Share of the variance of `returns` that is not in `errors`.
-fn explained_variance(returns: &[f32], errors: &[f32]) -> f64 {
-    1.0 - mean_and_variance(errors).1 / mean_and_variance(returns).1.max(1e-12)
 }
 
 #[cfg(test)]

@@ -4,12 +4,8 @@ use candle_core::{D, Tensor};
 
 use super::settings::PpoSettings;
 
-/// A part of a rollout as tensors, one row a sample.
+/// What was done in a part of a rollout and what came of it, one row a sample.
 pub struct Samples {
-    /// Normalised features (N × features).
-    pub features: Tensor,
-    /// Normalised privileged observations (N × privileged).
-    pub privileged: Tensor,
     /// Actions taken (N × actions).
     pub actions: Tensor,
     /// Log-probabilities of the actions when they were taken (N), up to the constant that [`log_probabilities`] leaves out.
@@ -106,13 +102,17 @@ pub fn divergence(old_means: &[f32], means: &[f32], old_log_std: &[f32], log_std
     rows.map(row).sum()
 }
 
-/// The step size after a mini-batch whose divergence was `divergence`.
-pub fn adapted_learning_rate(learning_rate: f64, divergence: f64, settings: &PpoSettings) -> f64 {
+/// The step size after a mini-batch whose divergence was `divergence`, between `lowest` and `highest`: it follows `target`.
+pub fn adapted_learning_rate(
+    learning_rate: f64,
+    divergence: f64,
+    target: f64,
+    [lowest, highest]: [f64; 2],
+) -> f64 {
     const FACTOR: f64 = 1.5;
-    let [lowest, highest] = settings.learning_rate;
-    if divergence > 2.0 * settings.target_divergence {
+    if divergence > 2.0 * target {
         (learning_rate / FACTOR).max(lowest)
-    } else if divergence < 0.5 * settings.target_divergence {
+    } else if divergence < 0.5 * target {
         (learning_rate * FACTOR).min(highest)
     } else {
         learning_rate
@@ -153,8 +153,6 @@ mod tests {
         let old: Vec<f64> = (0..3).map(|row| density(row) - LOG_RATIOS[row]).collect();
         Case {
             samples: Samples {
-                features: rows(&MEANS),
-                privileged: rows(&MEANS),
                 actions: rows(&ACTIONS),
                 log_probabilities: tensor(&old),
                 advantages: tensor(&advantages),
@@ -234,8 +232,7 @@ mod tests {
 
     #[test]
     fn the_step_follows_the_divergence_within_its_bounds() {
-        let settings = PpoSettings::default();
-        let next = |rate, divergence| adapted_learning_rate(rate, divergence, &settings);
+        let next = |rate, divergence| adapted_learning_rate(rate, divergence, 0.01, [5e-5, 1e-3]);
         assert!((next(3e-4, 0.03) - 2e-4).abs() < 1e-12);
         assert!((next(3e-4, 0.001) - 4.5e-4).abs() < 1e-12);
         assert_eq!(next(3e-4, 0.01), 3e-4);

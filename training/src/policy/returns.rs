@@ -35,6 +35,28 @@ pub fn advantages(trajectories: &Trajectories<'_>, discount: f64, trace_decay: f
     advantages
 }
 
+/// Mean 0 and deviation 1.
+pub fn standardized(values: &[f32]) -> Vec<f32> {
+    let (mean, variance) = mean_and_variance(values);
+    let scale = 1.0 / (variance.sqrt() + 1e-8);
+    values
+        .iter()
+        .map(|x| ((f64::from(*x) - mean) * scale) as f32)
+        .collect()
+}
+
+/// Share of the variance of `returns` that is not in `errors`.
+pub fn explained_variance(returns: &[f32], errors: &[f32]) -> f64 {
+    1.0 - mean_and_variance(errors).1 / mean_and_variance(returns).1.max(1e-12)
+}
+
+fn mean_and_variance(values: &[f32]) -> (f64, f64) {
+    let count = values.len().max(1) as f64;
+    let mean = values.iter().map(|x| f64::from(*x)).sum::<f64>() / count;
+    let squares = values.iter().map(|x| (f64::from(*x) - mean).powi(2));
+    (mean, squares.sum::<f64>() / count)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,0 +1,187 @@
+//! Deterministic evaluation of an EMP in training, beside the policy without one on the same seeds.
+
+use std::sync::Arc;
+
+use anyhow::Result;
+use emp_models::{
+    controller::Controller,
+    emp::{Emp, EmpFilter},
+    policy::Policy,
+    retarget::Retargeter,
+};
+use emp_motion::skills;
+use emp_sim::{
+    Pool,
+    evaluation::{Evaluation, ExecutedFrame, Observer, evaluate_observed},
+    goals::{GoalClip, Source},
+    suite::Condition,
+};
+use serde::Serialize;
+
+use super::data::FRAMES;
+
+/// Seed of the clips. Training clips are made from other seeds.
+const SEED: u64 = 0x656d_705f_6865_6c64;
+
+/// Under what an EMP is judged.
+const TRIALS: [Condition; 5] = [
+    Condition::Nominal,
+    Condition::Wide,
+    Condition::WideHeavy,
+    Condition::Pushed,
+    Condition::WidePushed,
+];
+
+/// Judges EMPs on procedural clips that they were not trained on.
+pub struct Judge {
+    clips: Vec<GoalClip>,
+    pool: Arc<Pool>,
+    policy: Arc<Policy>,
+    /// Without an EMP, trial by trial.
+    decoupled: Vec<Evaluation>,
+}
+
+/// What an EMP reaches under one trial.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Figures {
+    /// The trial.
+    pub trial: Condition,
+    /// Share of clips in which the robot fell.
+    pub falls: f64,
+    /// The same without the EMP.
+    pub falls_decoupled: f64,
+    /// Mean absolute change of a goal angle, rad.
+    pub change: f64,
+    /// Self-collision force as a share of that without the EMP.
+    pub msc_ratio: f64,
+    /// Difference of the paper's joint position metric to that without the EMP.
+    pub mjp_difference: f64,
+}
+
+impl Figures {
+    const NAMES: [&'static str; 5] = [
+        "falls",
+        "falls_decoupled",
+        "change",
+        "msc_ratio",
+        "mjp_difference",
+    ];
+
+    fn numbers(&self) -> [f64; 5] {
+        [
+            self.falls,
+            self.falls_decoupled,
+            self.change,
+            self.msc_ratio,
+            self.mjp_difference,
+        ]
+    }
+}
+
+/// What an EMP reaches.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Verdict {
+    /// Each trial.
+    pub trials: Vec<Figures>,
+}
+
+impl Verdict {
+    /// Columns of a log.
+    pub fn columns() -> Vec<String> {
+        let mut columns = vec!["step".to_owned()];
+        for trial in TRIALS {
+            let names = Figures::NAMES.map(|name| format!("{name}_{}", trial.name()));
+            columns.extend(names);
+        }
+        columns
+    }
+
+    /// The numbers of a log's row.
+    pub fn row(&self) -> Vec<f64> {
+        self.trials.iter().flat_map(Figures::numbers).collect()
+    }
+}
+
+impl Judge {
+    /// A judge with one clip of each of `clips` procedural motions, on `pool`.
+    ///
+    /// # Errors
+    /// When the retargeter or the policy fails.
+    pub fn new(
+        retargeter: &Retargeter,
+        policy: Arc<Policy>,
+        clips: usize,
+        pool: Arc<Pool>,
+        threads: usize,
+    ) -> Result<Self> {
+        let motion = skills::library(SEED, clips);
+        let goals = GoalClip::retargeted(retargeter, &motion, Source::Procedural, threads)?;
+        let first_window = |clip: &GoalClip| clip.windows(FRAMES).into_iter().next();
+        let mut judge = Self {
+            clips: goals.iter().filter_map(first_window).collect(),
+            pool,
+            decoupled: Vec::new(),
+            policy,
+        };
+        let decoupled = Controller::new(Arc::clone(&judge.policy), None);
+        for trial in TRIALS {
+            let (evaluation, _) = judge.evaluate(&decoupled, trial)?;
+            judge.decoupled.push(evaluation);
+        }
+        Ok(judge)
+    }
+
+    /// Judges an EMP. The same EMP always gets the same verdict.
+    ///
+    /// # Errors
+    /// When the EMP fails.
+    pub fn judge(&self, emp: Emp) -> Result<Verdict> {
+        let filter = Arc::new(EmpFilter::always(Arc::new(emp)));
+        let controller = Controller::new(Arc::clone(&self.policy), Some(filter));
+        let trials = TRIALS.into_iter().zip(&self.decoupled);
+        let trials = trials.map(|(trial, decoupled)| {
+            let (evaluation, change) = self.evaluate(&controller, trial)?;
+            let (with, without) = (&evaluation.all.metrics, &decoupled.all.metrics);
+            Ok(Figures {
+                trial,
+                falls: 1.0 - with.suc.mean,
+                falls_decoupled: 1.0 - without.suc.mean,
+                change,
+                msc_ratio: with.msc.mean / without.msc.mean.max(1e-9),
+                mjp_difference: with.mjp.mean - without.mjp.mean,
+            })
+        });
+        Ok(Verdict {
+            trials: trials.collect::<Result<_>>()?,
+        })
+    }
+
+    /// An evaluation, and the mean absolute change of a goal angle, rad.
+    fn evaluate(&self, controller: &Controller, trial: Condition) -> Result<(Evaluation, f64)> {
+        let settings = trial.settings(self.policy.robot(), SEED);
+        let mut change = Change::default();
+        let evaluation = evaluate_observed(
+            &self.pool,
+            controller,
+            &self.clips,
+            &settings,
+            &mut (),
+            &mut change,
+        )?;
+        Ok((evaluation, change.sum / change.angles.max(1.0)))
+    }
+}
+
+#[derive(Default)]
+struct Change {
+    sum: f64,
+    angles: f64,
+}
+
+impl Observer for Change {
+    fn executed(&mut self, frame: &ExecutedFrame<'_>) {
+        let pairs = frame.output.goal.iter().zip(frame.asked);
+        self.sum += pairs.map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
+        self.angles += frame.asked.len() as f64;
+    }
+}

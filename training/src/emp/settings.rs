@@ -1,0 +1,356 @@
+//! Settings of an EMP's training. Two runs with the same settings, data and binary make the same bits.
+
+use anyhow::{Context as _, Result, bail};
+use emp_models::{
+    emp::{DangerGate, EmpConfig, Output},
+    observation::{HISTORY, HistoryMap, ObservationLayout},
+};
+use emp_robot::Robot;
+use emp_sim::tracking::TrackingSettings;
+use serde::{Deserialize, Serialize};
+
+use super::losses::{CenOn, CenRef, LossSettings, LossWeights, SmoothOn};
+
+/// A set of settings with a name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Preset {
+    /// The printed form: the paper's sizes, an absolute answer, losses on one imagined step.
+    Paper,
+    /// The best that we found: a small network, a correction, and a price on falls that is learnt from real rollouts.
+    Default,
+}
+
+/// Everything that shapes a run but the robot and its data.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// Seed of weights, episodes and mini-batches.
+    pub seed: u64,
+    /// Environments stepped side by side.
+    pub environments: usize,
+    /// Control periods collected between two updates.
+    pub frames: usize,
+    /// Control periods with unchanged goals, before anything is learnt: normalisation and the policy's operating point follow
+    /// from them.
+    pub warm_up: usize,
+    /// The networks.
+    pub network: NetworkSettings,
+    /// The six losses.
+    pub losses: LossSettings,
+    /// Imagined control periods over which the losses are taken; 1 is the paper's. 0: nothing is imagined, and the losses see
+    /// ĝ and the measured robot alone.
+    pub horizon: usize,
+    /// Control periods of the world model's loss beyond which it is not followed; 1 is the paper's.
+    pub wm_loss_steps: usize,
+    /// What falls cost, learnt from real rollouts.
+    pub risk: RiskSettings,
+    /// Steps of the optimiser.
+    pub optimizer: OptimizerSettings,
+    /// The motion and the conditions of the episodes.
+    pub episodes: TrackingSettings,
+    /// Share of the clips that come from the network alone, with its jitter, as a live stream without refinement would.
+    pub live: f64,
+    /// Environment steps between two evaluations.
+    pub evaluate_every: u64,
+    /// Procedural clips of such an evaluation.
+    pub evaluation_clips: usize,
+    /// Procedural motions in the training set.
+    pub procedural_clips: usize,
+}
+
+/// Shape of an EMP: see [`EmpConfig`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NetworkSettings {
+    /// The state encoder sees differences of frames instead of whole stacks.
+    pub differences: bool,
+    /// What the decoder's answer means.
+    pub output: Output,
+    /// Widths of the state encoder's hidden layers.
+    pub state_hidden: Vec<usize>,
+    /// Widths of the target encoder's hidden layers.
+    pub target_hidden: Vec<usize>,
+    /// Width of z₁ and of z₂.
+    pub encoding: usize,
+    /// Widths of the fusion network's hidden layers.
+    pub fusion_hidden: Vec<usize>,
+    /// Width of the latent z.
+    pub latent: usize,
+    /// Widths of the decoder's hidden layers.
+    pub decoder_hidden: Vec<usize>,
+    /// When "EMP when danger" filters.
+    pub gate: DangerGate,
+}
+
+impl NetworkSettings {
+    /// The shape for `robot`.
+    pub fn config(&self, robot: &Robot) -> EmpConfig {
+        EmpConfig {
+            observation: ObservationLayout::new(robot, HISTORY),
+            history_map: if self.differences {
+                HistoryMap::differences()
+            } else {
+                HistoryMap::identity(HISTORY)
+            },
+            output: self.output,
+            state_hidden: self.state_hidden.clone(),
+            target_hidden: self.target_hidden.clone(),
+            encoding: self.encoding,
+            fusion_hidden: self.fusion_hidden.clone(),
+            latent: self.latent,
+            decoder_hidden: self.decoder_hidden.clone(),
+            gate: self.gate,
+        }
+    }
+}
+
+/// The price of falls and of what leads to them. One imagined period cannot see a fall that builds up over a second, and the
+/// simulator has no gradient; so the gradient of the expected cost of what really follows is estimated from rollouts with
+/// explored goals, by proximal policy optimisation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RiskSettings {
+    /// Weight of the expected cost beside the six losses; a fall costs 1. 0: no exploration, no risk term.
+    pub weight: f64,
+    /// Cost of one period of `L_ori`, of the measured base.
+    pub orientation: f64,
+    /// Cost of one period of `L_cen`, where it is positive: of the measured centre of mass away from the policy's operating
+    /// point.
+    pub centroid: f64,
+    /// Cost of one period with 100 N between the robot's own links.
+    pub contact: f64,
+    /// Discount γ.
+    pub discount: f64,
+    /// Decay λ of the generalised advantage estimate.
+    pub trace_decay: f64,
+    /// The probability ratio is clipped to 1 ± this.
+    pub clip: f64,
+    /// Standard deviation of exploration, rad.
+    pub std: f64,
+    /// The step size follows this divergence between the EMP before the update and now.
+    pub target_divergence: f64,
+    /// Widths of the critic's hidden layers.
+    pub critic_hidden: Vec<usize>,
+    /// Step size of the critic.
+    pub critic_learning_rate: f64,
+}
+
+/// Steps of the optimiser after each rollout.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OptimizerSettings {
+    /// Mini-batches after each rollout.
+    pub updates: usize,
+    /// Rows of a mini-batch; all rows of a rollout are used before one is used again.
+    pub rows: usize,
+    /// Parts of a mini-batch whose gradients are computed in parallel and added in order. Fixed, whatever the number of
+    /// threads: the sum's last bits depend on it.
+    pub shards: usize,
+    /// Bounds of the step size; it starts at the upper one, and stays there without risk.
+    pub learning_rate: [f64; 2],
+    /// Bound of the gradient's norm.
+    pub max_gradient_norm: f64,
+}
+
+impl Settings {
+    /// The settings of a preset.
+    pub fn preset(preset: Preset) -> Self {
+        match preset {
+            Preset::Paper => Self::paper(),
+            Preset::Default => Self::best(),
+        }
+    }
+
+    fn paper() -> Self {
+        Self {
+            seed: 1,
+            environments: 128,
+            frames: 32,
+            warm_up: 64,
+            network: NetworkSettings {
+                differences: false,
+                output: Output::Absolute,
+                state_hidden: vec![1024, 1024],
+                target_hidden: vec![1024, 1024],
+                encoding: 64,
+                fusion_hidden: vec![2048, 2048],
+                latent: 32,
+                decoder_hidden: vec![2048, 2048],
+                gate: DangerGate::PAPER,
+            },
+            losses: LossSettings::default(),
+            horizon: 1,
+            wm_loss_steps: 1,
+            risk: RiskSettings {
+                weight: 0.0,
+                orientation: 0.05,
+                centroid: 0.0,
+                contact: 0.01,
+                discount: 0.99,
+                trace_decay: 0.95,
+                clip: 0.2,
+                std: 0.05,
+                target_divergence: 0.01,
+                critic_hidden: vec![256, 128, 64],
+                critic_learning_rate: 1e-3,
+            },
+            optimizer: OptimizerSettings {
+                updates: 8,
+                rows: 256,
+                shards: 4,
+                learning_rate: [1e-4, 1e-4],
+                max_gradient_norm: 10.0,
+            },
+            episodes: TrackingSettings::default(),
+            live: 0.25,
+            evaluate_every: 500_000,
+            evaluation_clips: 128,
+            procedural_clips: 1000,
+        }
+    }
+
+    fn best() -> Self {
+        let paper = Self::paper();
+        Self {
+            environments: 256,
+            network: NetworkSettings {
+                differences: true,
+                output: Output::Residual,
+                state_hidden: vec![256, 128],
+                target_hidden: vec![128, 128],
+                encoding: 64,
+                fusion_hidden: vec![256, 128],
+                latent: 32,
+                decoder_hidden: vec![128, 128],
+                gate: DangerGate::Tilt(0.12),
+            },
+            losses: LossSettings {
+                weights: LossWeights {
+                    orientation: 0.0,
+                    collision: 0.0,
+                    centroid: 0.0,
+                    regularization: 0.01,
+                    ..LossWeights::default()
+                },
+                smooth_on: SmoothOn::Correction,
+                cen_on: CenOn::QuasiStatic,
+                cen_ref: CenRef::Measured,
+            },
+            horizon: 0,
+            risk: RiskSettings {
+                weight: 200.0,
+                ..paper.risk.clone()
+            },
+            optimizer: OptimizerSettings {
+                updates: 12,
+                rows: 2048,
+                shards: 4,
+                learning_rate: [5e-5, 1e-3],
+                max_gradient_norm: 10.0,
+            },
+            ..paper
+        }
+    }
+
+    /// Changes one setting: `key` is its path with dots, as in `risk.weight`; `value` is JSON, or a bare word.
+    ///
+    /// # Errors
+    /// When there is no such setting, or it cannot have that value.
+    pub fn set(&mut self, key: &str, value: &str) -> Result<()> {
+        let mut settings = serde_json::to_value(&*self)?;
+        let place = key
+            .split('.')
+            .try_fold(&mut settings, |place, name| place.get_mut(name));
+        let Some(place) = place else {
+            bail!("no setting `{key}`; --print-settings shows all");
+        };
+        *place = serde_json::from_str(value)
+            .unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
+        *self = serde_json::from_value(settings)
+            .with_context(|| format!("setting `{key}` cannot be {value}"))?;
+        Ok(())
+    }
+
+    /// Refuses settings with which nothing can be learnt.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn check(&self) -> Result<()> {
+        let counts = [
+            ("environments", self.environments),
+            ("frames", self.frames),
+            ("warm_up", self.warm_up),
+            ("optimizer.updates", self.optimizer.updates),
+            ("optimizer.rows", self.optimizer.rows),
+            ("optimizer.shards", self.optimizer.shards),
+            ("evaluation_clips", self.evaluation_clips),
+        ];
+        if let Some((name, _)) = counts.iter().find(|(_, count)| *count == 0) {
+            bail!("setting `{name}` is 0, expected at least 1");
+        }
+        if self.horizon >= self.frames {
+            bail!(
+                "setting `horizon` is {}, expected less than `frames`, {}",
+                self.horizon,
+                self.frames
+            );
+        }
+        if !(0.0..=1.0).contains(&self.live) {
+            bail!(
+                "setting `live` is {}, expected a share from 0 to 1",
+                self.live
+            );
+        }
+        if self.risk.weight < 0.0 || self.risk.std <= 0.0 {
+            bail!("settings `risk.weight` and `risk.std` must not be negative, nor `risk.std` 0");
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_are_changed_by_their_path_and_mistakes_are_named() {
+        let mut settings = Settings::preset(Preset::Paper);
+        settings.set("risk.weight", "20").unwrap();
+        settings.set("losses.smooth_on", "correction").unwrap();
+        settings.set("network.gate", r#"{"tilt": 0.3}"#).unwrap();
+        settings.set("network.state_hidden", "[32]").unwrap();
+        assert_eq!(settings.risk.weight, 20.0);
+        assert_eq!(settings.losses.smooth_on, SmoothOn::Correction);
+        assert_eq!(settings.network.gate, DangerGate::Tilt(0.3));
+        assert_eq!(settings.network.state_hidden, [32]);
+        for (key, value) in [
+            ("risk.wait", "1"),
+            ("horizon", "-1"),
+            ("losses.cen_on", "moon"),
+        ] {
+            let before = settings.clone();
+            let error = settings.set(key, value).unwrap_err().to_string();
+            assert!(error.contains(key), "{error}");
+            assert_eq!(settings, before);
+        }
+        settings.set("optimizer.rows", "0").unwrap();
+        let error = settings.check().unwrap_err().to_string();
+        assert!(error.contains("optimizer.rows"), "{error}");
+    }
+
+    #[test]
+    fn the_presets_can_be_trained_and_the_papers_is_the_papers() {
+        let robot = Robot::load("../robots/emp27".as_ref()).unwrap();
+        for preset in [Preset::Paper, Preset::Default] {
+            Settings::preset(preset).check().unwrap();
+        }
+        let paper = Settings::preset(Preset::Paper);
+        assert_eq!(paper.network.config(&robot), EmpConfig::paper(&robot));
+        assert_eq!(paper.losses, LossSettings::default());
+        assert_eq!(
+            (paper.horizon, paper.wm_loss_steps, paper.risk.weight),
+            (1, 1, 0.0)
+        );
+    }
+}

@@ -1,0 +1,363 @@
+//! The training loop of the EMP (paper, Algorithm 1): rollouts with goals as they are asked for teach the world model, rollouts
+//! with the EMP's goals teach the EMP, in turn.
+//!
+//! The paper updates after every control period of a batch of clips; we update after every few, on mini-batches of them: one
+//! update then sees many moments of many clips. Without imagination there is no world model to teach.
+
+use std::{path::Path, sync::Arc, time::Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use candle_core::{Device, Tensor};
+use emp_models::{
+    CheckpointMetadata,
+    checkpoint::{self, Tensors},
+    emp::{self, Emp, NETWORK_PREFIX},
+};
+use emp_robot::Robot;
+use emp_sim::{Pool, goals::GoalClip, tracking::TrackingEnvironments};
+use serde::{Deserialize, Serialize};
+
+use super::{
+    judge::{Judge, Verdict},
+    learner::{self, Learner, UpdateStatistics, WarmUp},
+    objective::Terms,
+    rollout::{Cost, CostSums, Explorer},
+    settings::Settings,
+};
+use crate::{
+    log::CsvLog,
+    run::{self, Interrupt, Outcome, RunFiles},
+};
+use emp_models::policy::Policy;
+
+/// Kind of the checkpoints in a run's folder, which hold the critic, the optimisers and the environments too.
+const RUN_KIND: &str = "emp-run";
+
+/// The environments' snapshot in a checkpoint.
+const ENVIRONMENTS: &str = "environments";
+
+/// Columns of the log after the step and the losses.
+const COLUMNS: [&str; 13] = [
+    "risk",
+    "falls",
+    "tilt",
+    "centroid_measured",
+    "contact",
+    "mean_change",
+    "episodes",
+    "explained_variance",
+    "kl",
+    "learning_rate",
+    "gradient_norm",
+    "seconds_collecting",
+    "seconds_learning",
+];
+
+/// What a run trains with.
+pub struct Equipment {
+    /// The robot.
+    pub robot: Arc<Robot>,
+    /// The frozen policy.
+    pub policy: Arc<Policy>,
+    /// Physics.
+    pub pool: Arc<Pool>,
+    /// The clips.
+    pub clips: Arc<[GoalClip]>,
+    /// Threads of forward and backward passes.
+    pub threads: rayon::ThreadPool,
+}
+
+/// A run: the learner, its environments, and how far they are.
+pub struct Trainer {
+    equipment: Equipment,
+    settings: Settings,
+    explorer: Explorer,
+    learner: Learner,
+    /// Environment steps learnt from.
+    steps: u64,
+}
+
+/// What a run's checkpoint says of its progress.
+#[derive(Serialize, Deserialize)]
+struct Saved {
+    settings: Settings,
+    steps: u64,
+    learner: learner::Progress,
+}
+
+/// A run's files and its judge.
+pub struct Run<'a> {
+    /// Where it writes.
+    pub files: &'a RunFiles,
+    /// Who judges it.
+    pub judge: &'a Judge,
+    /// What the weights say of the data.
+    pub data: serde_json::Value,
+}
+
+impl Trainer {
+    /// Starts with random weights.
+    ///
+    /// # Errors
+    /// When a setting is out of bounds, or the robot falls whatever it is asked for.
+    pub fn new(equipment: Equipment, settings: Settings) -> Result<Self> {
+        settings.check()?;
+        let mut explorer = Explorer::new(environments(&equipment, &settings)?, settings.seed);
+        let cost = Cost {
+            settings: &settings.risk,
+            reference: [0.0; 2],
+        };
+        let threads = &equipment.threads;
+        let rollout = explorer.collect(None, 0.0, settings.warm_up, &cost, threads)?;
+        let layout = *explorer.environments().layout();
+        let warm_up = WarmUp::new(rollout, &layout)?;
+        Ok(Self {
+            learner: Learner::new(&equipment.robot, &settings, &warm_up)?,
+            explorer,
+            equipment,
+            settings,
+            steps: 0,
+        })
+    }
+
+    /// Continues from a checkpoint of this run.
+    ///
+    /// # Errors
+    /// When the checkpoint is damaged, or its run had other settings or another robot.
+    pub fn resume(equipment: Equipment, settings: Settings, path: &Path) -> Result<Self> {
+        let (metadata, mut tensors) = checkpoint::load(path)?;
+        metadata.check(path, &run_metadata(&equipment.robot))?;
+        let saved: Saved = serde_json::from_value(metadata.training)
+            .with_context(|| format!("{}: metadata field training", path.display()))?;
+        ensure!(
+            saved.settings == settings,
+            "{}: the run was started with {:?}, not with {settings:?}",
+            path.display(),
+            saved.settings
+        );
+        let environments = tensors
+            .remove(ENVIRONMENTS)
+            .with_context(|| format!("{}: no tensor `{ENVIRONMENTS}`", path.display()))?;
+        let mut trainer = Self::new(equipment, settings)?;
+        trainer
+            .explorer
+            .restore(&environments.to_vec1::<u8>()?)
+            .with_context(|| path.display().to_string())?;
+        trainer
+            .learner
+            .restore(&tensors, saved.learner)
+            .with_context(|| path.display().to_string())?;
+        trainer.steps = saved.steps;
+        Ok(trainer)
+    }
+
+    /// Environment steps learnt from so far.
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    /// The EMP as it is now.
+    ///
+    /// # Errors
+    /// When a tensor cannot be made.
+    pub fn emp(&self) -> Result<Emp> {
+        let mut tensors: Tensors = self.learner.normalizer().tensors()?.into_iter().collect();
+        for (name, tensor) in self.learner.network().tensors() {
+            tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor.copy()?);
+        }
+        let robot = &self.equipment.robot;
+        let metadata = CheckpointMetadata::for_joints(emp::KIND, robot, robot.joints());
+        let config = self.learner.network().config().clone();
+        Emp::from_tensors(config, Arc::clone(robot), tensors, metadata).map_err(anyhow::Error::msg)
+    }
+
+    /// Writes the EMP for serving: the networks as f16.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn export(
+        &self,
+        path: &Path,
+        data: &serde_json::Value,
+        verdict: &Verdict,
+    ) -> Result<CheckpointMetadata> {
+        let training = serde_json::json!({
+            "command": "emp-train emp",
+            "settings": self.settings,
+            "steps": self.steps,
+            "policy": self.equipment.policy.metadata().version(),
+            "operating_point": self.learner.reference(),
+            "data": data,
+            "figures": verdict,
+        });
+        Ok(Emp::save(
+            path,
+            &self.equipment.robot,
+            self.learner.network().config(),
+            self.learner.normalizer(),
+            &self.learner.network().tensors(),
+            training,
+            run::git_revision(),
+        )?)
+    }
+
+    /// Writes everything that the run depends on.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn save_run(&self, path: &Path) -> Result<()> {
+        let mut tensors = self.learner.state()?;
+        let environments = self.explorer.snapshot()?;
+        let bytes = environments.len();
+        tensors.insert(
+            ENVIRONMENTS.to_owned(),
+            Tensor::from_vec(environments, bytes, &Device::Cpu)?,
+        );
+        let mut metadata = run_metadata(&self.equipment.robot);
+        metadata.config = serde_json::to_value(self.learner.network().config())?;
+        metadata.training = serde_json::to_value(Saved {
+            settings: self.settings.clone(),
+            steps: self.steps,
+            learner: self.learner.progress(),
+        })?;
+        checkpoint::save(path, metadata, &tensors)?;
+        Ok(())
+    }
+
+    /// Collects a rollout and learns from it.
+    fn step(&mut self) -> Result<Step> {
+        let start = Instant::now();
+        let risk = &self.settings.risk;
+        let cost = Cost {
+            settings: risk,
+            reference: self.learner.reference(),
+        };
+        let std = if risk.weight > 0.0 { risk.std } else { 0.0 };
+        let threads = &self.equipment.threads;
+        let network = self.learner.network().clone();
+        let frames = self.settings.frames;
+        let rollout = self
+            .explorer
+            .collect(Some(&network), std, frames, &cost, threads)?;
+        let collecting = start.elapsed().as_secs_f64();
+        let update = self.learner.update(&rollout, threads)?;
+        let rows = rollout.rows();
+        self.steps += rows as u64;
+        let changes = rollout.means.iter().zip(&rollout.goals);
+        let change: f64 = changes.map(|(a, b)| f64::from((a - b).abs())).sum();
+        Ok(Step {
+            change: change / rollout.means.len() as f64,
+            sums: rollout.sums,
+            episodes: rollout.episodes(),
+            rows,
+            update,
+            collecting,
+        })
+    }
+}
+
+/// What one rollout and its update measured.
+struct Step {
+    sums: CostSums,
+    /// Mean absolute change of a goal angle, rad.
+    change: f64,
+    episodes: usize,
+    rows: usize,
+    update: UpdateStatistics,
+    collecting: f64,
+}
+
+impl Step {
+    fn row(&self) -> Vec<f64> {
+        let (sums, update, rows) = (&self.sums, &self.update, self.rows as f64);
+        let mut row = update.terms.to_vec();
+        row.extend([
+            update.risk,
+            sums.falls,
+            sums.orientation / rows,
+            sums.centroid / rows,
+            sums.contact / rows,
+            self.change,
+            self.episodes as f64,
+            update.explained_variance,
+            update.divergence,
+            update.learning_rate,
+            update.gradient_norm,
+            self.collecting,
+            update.seconds,
+        ]);
+        row
+    }
+
+    fn message(&self) -> String {
+        format!(
+            "falls {} of {} change {:.3} rad contact {:.1} N",
+            self.sums.falls,
+            self.episodes,
+            self.change,
+            self.sums.contact / self.rows as f64,
+        )
+    }
+}
+
+/// Trains until `steps` environment steps are learnt from, or the interrupt.
+///
+/// # Errors
+/// When a file cannot be written, or the gradient stops being a number.
+pub fn train(
+    trainer: &mut Trainer,
+    steps: u64,
+    run: &Run<'_>,
+    interrupt: &Interrupt,
+) -> Result<Outcome> {
+    let done = trainer.steps();
+    let resumed = (done > 0).then_some(done);
+    let mut columns = vec!["step"];
+    columns.extend(Terms::NAMES);
+    columns.extend(COLUMNS);
+    let mut log = CsvLog::open(&run.files.log(), &columns, resumed)?;
+    let mut verdicts = CsvLog::open(&run.files.evaluations(), &Verdict::columns(), resumed)?;
+    let bar = run::progress(steps, done);
+    let mut saved = Instant::now();
+    while trainer.steps() < steps {
+        if interrupt.requested() {
+            trainer.save_run(&run.files.checkpoint())?;
+            bar.abandon_with_message("interrupted; continue with --resume");
+            return Ok(Outcome::Interrupted);
+        }
+        let before = trainer.steps();
+        let step = trainer.step()?;
+        log.row(trainer.steps(), &step.row())?;
+        bar.set_position(trainer.steps());
+        bar.set_message(step.message());
+        let every = trainer.settings.evaluate_every.max(1);
+        if before / every < trainer.steps() / every || trainer.steps() >= steps {
+            let verdict = run.judge.judge(trainer.emp()?)?;
+            verdicts.row(trainer.steps(), &verdict.row())?;
+            trainer.export(&run.files.weights, &run.data, &verdict)?;
+        }
+        if saved.elapsed() >= run.files.save_every {
+            trainer.save_run(&run.files.checkpoint())?;
+            saved = Instant::now();
+        }
+    }
+    trainer.save_run(&run.files.checkpoint())?;
+    bar.finish();
+    Ok(Outcome::Finished)
+}
+
+fn environments(equipment: &Equipment, settings: &Settings) -> Result<TrackingEnvironments> {
+    Ok(TrackingEnvironments::new(
+        Arc::clone(&equipment.robot),
+        Arc::clone(&equipment.pool),
+        Arc::clone(&equipment.policy),
+        settings.episodes,
+        Arc::clone(&equipment.clips),
+        0..settings.environments as u64,
+        settings.seed,
+    )?)
+}
+
+fn run_metadata(robot: &Robot) -> CheckpointMetadata {
+    CheckpointMetadata::for_joints(RUN_KIND, robot, robot.joints())
+}

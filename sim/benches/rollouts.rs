@@ -16,6 +16,7 @@ use emp_models::policy::{KIND, NETWORK_PREFIX, Policy, PolicyConfig};
 use emp_robot::Robot;
 use emp_sim::environment::{EnvironmentConfig, Randomization, VecEnvironment};
 use emp_sim::goals::{GoalClip, GoalLibrary, Source};
+use emp_sim::tracking::{TrackingEnvironments, TrackingSettings};
 use emp_sim::{Body, BodyParameters, Collector, Pool, Priority, Stage, Start, Targets};
 use mujoco_rs::prelude::*;
 use rayon::prelude::*;
@@ -88,6 +89,10 @@ fn measure(robot: &Arc<Robot>, threads: usize) {
                 &library,
                 Randomization::default(),
             )),
+        ),
+        (
+            "tracking environments",
+            Box::new(tracking(robot, &pool, &policy, &library)),
         ),
     ];
     let mut times = vec![Vec::new(); kinds.len()];
@@ -231,6 +236,33 @@ fn rollouts(
         collector
             .collect(&policy, &log_std, PERIODS)
             .expect("a rollout");
+        start.elapsed()
+    }
+}
+
+/// Control periods under the mixed conditions of EMP training, resets included.
+fn tracking(
+    robot: &Arc<Robot>,
+    pool: &Arc<Pool>,
+    policy: &Arc<Policy>,
+    library: &GoalLibrary,
+) -> impl FnMut() -> Duration + use<> {
+    let environments = TrackingEnvironments::new(
+        Arc::clone(robot),
+        Arc::clone(pool),
+        Arc::clone(policy),
+        TrackingSettings::default(),
+        library.clips().cloned().collect(),
+        0..BODIES as u64,
+        1,
+    );
+    let mut environments = environments.expect("environments");
+    move || {
+        let start = Instant::now();
+        for _ in 0..PERIODS {
+            let goals = environments.goals().to_vec();
+            environments.step(&goals).expect("a control period");
+        }
         start.elapsed()
     }
 }

@@ -2,6 +2,8 @@
 
 use mujoco_rs::prelude::MjDataError;
 
+use crate::goals::GoalError;
+
 /// Why a simulation could not be run to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
@@ -50,6 +52,9 @@ pub enum SimError {
     /// A snapshot is not one of these environments.
     #[error("the snapshot does not fit: {0}")]
     Snapshot(String),
+    /// Goals cannot be used.
+    #[error(transparent)]
+    Goals(#[from] GoalError),
     /// A policy could not be run.
     #[error("the policy failed: {0}")]
     Policy(#[from] emp_models::ModelError),

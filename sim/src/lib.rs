@@ -37,10 +37,12 @@ pub mod ladder;
 pub mod metrics;
 mod physics;
 mod pool;
+mod pushes;
 mod skeleton;
 pub mod suite;
 #[cfg(test)]
 mod testing;
+pub mod tracking;
 
 pub use collector::{Collector, End, Episode, Rollout, RolloutStatistics};
 pub use collision::SelfCollision;

@@ -3,21 +3,17 @@
 use std::fmt;
 use std::sync::Arc;
 
-use emp_models::observation::{HISTORY, History, ObservationLayout, RobotState};
 use emp_robot::Robot;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::privileged::{AHEAD, PrivilegedState};
-use super::randomization::{leg_targets, within};
 use super::rewards::Outcome;
-use super::{EnvironmentConfig, PrivilegedLayout, REWARD_TERMS, Randomization};
+use super::subject::{Conditions, Kind, Subject};
+use super::{EnvironmentConfig, REWARD_TERMS, Randomization};
 use crate::goals::{GoalLibrary, GoalStream};
-use crate::{Body, Divergence, Reading, Stage, Start, Targets};
-
-/// Acceleration of gravity that turns the robot's mass into its weight, m/s².
-const GRAVITY: f64 = 9.81;
+use crate::pushes::Pushes;
+use crate::{Divergence, Reading, Stage};
 
 /// Why an episode ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -46,23 +42,13 @@ impl fmt::Display for EndReason {
 /// What all environments share.
 #[derive(Debug)]
 pub(super) struct Setting {
-    pub(super) robot: Arc<Robot>,
+    pub(super) kind: Kind,
     pub(super) config: EnvironmentConfig,
     pub(super) library: Arc<GoalLibrary>,
-    pub(super) observation: ObservationLayout,
-    pub(super) privileged: PrivilegedLayout,
     /// The randomisation at its present scale.
     pub(super) randomization: Randomization,
     /// Largest amplitude of goals.
     pub(super) difficulty: f32,
-    /// Leg angles of the default pose, rad.
-    leg_default: Vec<f32>,
-    /// Bodies of the model.
-    bodies: usize,
-    mass: f64,
-    standing_height: f64,
-    /// Control periods between pushes.
-    push_interval: Option<usize>,
 }
 
 impl Setting {
@@ -70,26 +56,11 @@ impl Setting {
         robot: Arc<Robot>,
         config: EnvironmentConfig,
         library: Arc<GoalLibrary>,
-        bodies: usize,
     ) -> Self {
-        let observation = ObservationLayout::new(&robot, HISTORY);
-        let rate = robot.control_rate_hz();
-        let push = config.randomization.push;
         Self {
-            privileged: PrivilegedLayout::new(&observation),
-            observation,
+            kind: Kind::new(robot),
             randomization: config.randomization,
             difficulty: 1.0,
-            leg_default: robot
-                .leg_joints()
-                .iter()
-                .map(|joint| joint.default as f32)
-                .collect(),
-            bodies,
-            mass: robot.mass(),
-            standing_height: robot.standing_height(),
-            push_interval: push.map(|push| (push.interval * rate).round() as usize),
-            robot,
             config,
             library,
         }
@@ -97,7 +68,7 @@ impl Setting {
 
     /// Why an episode with this reading ends, if it does.
     pub(super) fn fall(&self, reading: &Reading) -> Option<EndReason> {
-        self.config.fall(reading, self.standing_height)
+        self.config.fall(reading, self.kind.standing_height)
     }
 }
 
@@ -120,25 +91,12 @@ pub(super) struct Environment {
     seeds: ChaCha8Rng,
     /// The episode's own.
     rng: ChaCha8Rng,
-    body: Body,
-    history: History,
+    subject: Subject,
     goals: GoalStream,
-    /// The present goal `g_t`.
-    goal: Vec<f32>,
-    /// Goals ahead of it.
-    ahead: [Vec<f32>; 2],
-    /// The last two actions, newest first, policy units.
-    actions: [Vec<f32>; 2],
-    /// Leg targets, rad.
-    legs: Vec<f32>,
     /// Control periods until the episode times out.
     left: usize,
     /// Control periods since it began.
     age: u32,
-    /// Control periods until the next push.
-    until_push: usize,
-    /// What the critic is told of the parameters.
-    parameters: Vec<f32>,
 }
 
 impl Environment {
@@ -149,30 +107,15 @@ impl Environment {
         seeds.set_stream(index);
         let mut rng = ChaCha8Rng::seed_from_u64(seeds.next_u64());
         let goals = setting.library.stream(rng.next_u64(), setting.difficulty);
-        let legs = setting.leg_default.len();
-        let joints = setting.library.joints();
-        let frames = setting.config.episode_frames;
-        let parameters = setting.privileged.parameters().len();
+        let left = rng.random_range(1..=setting.config.episode_frames);
         let mut environment = Self {
-            left: rng.random_range(1..=frames),
-            body: stage.place(&Start {
-                joint_positions: &vec![0.0; joints + legs],
-                lift: 0.0,
-                parameters: Default::default(),
-            }),
+            subject: Subject::new(&setting.kind, stage),
             seeds,
             rng,
-            history: History::new(setting.observation),
             goals,
-            goal: vec![0.0; joints],
-            ahead: [vec![0.0; joints], vec![0.0; joints]],
-            actions: [vec![0.0; legs], vec![0.0; legs]],
-            legs: vec![0.0; legs],
+            left,
             age: 0,
-            until_push: 0,
-            parameters: vec![0.0; parameters],
         };
-        let left = environment.left;
         environment.reset(setting, stage);
         environment.left = left;
         environment
@@ -181,41 +124,29 @@ impl Environment {
     /// Starts a new episode.
     fn reset(&mut self, setting: &Setting, stage: &mut Stage) {
         self.rng = ChaCha8Rng::seed_from_u64(self.seeds.next_u64());
-        let (rng, ranges, robot) = (&mut self.rng, &setting.randomization, &setting.robot);
-        let parameters = ranges.draw(robot, setting.bodies, rng);
-        self.goals = setting.library.stream(rng.next_u64(), setting.difficulty);
-        self.goals.next(&setting.library, &mut self.goal);
-        let start = self.goal.iter().chain(&setting.leg_default);
-        let joints: Vec<f64> = robot
-            .joints()
-            .zip(start)
-            .map(|(joint, &angle)| {
-                let angle = f64::from(angle) + within(ranges.initial_joints, 0.0, rng);
-                angle.clamp(joint.range[0], joint.range[1])
-            })
-            .collect();
-        let hanging: f64 = rng.random();
-        let hang = ranges.hang.filter(|hang| hanging < hang.ratio);
-        self.until_push = rng.random_range(0..setting.push_interval.unwrap_or(1));
-        self.body = stage.place(&Start {
-            joint_positions: &joints,
-            lift: hang.map_or(0.0, |hang| hang.height),
+        let ranges = &setting.randomization;
+        let parameters = setting.kind.draw(ranges, &mut self.rng);
+        self.goals = setting
+            .library
+            .stream(self.rng.next_u64(), setting.difficulty);
+        self.next_goal(setting);
+        let conditions = Conditions {
             parameters,
-        });
-        let added = stage.mass() - setting.mass;
-        setting.privileged.write_parameters(
-            robot,
-            self.body.parameters(),
-            added,
-            &mut self.parameters,
-        );
-        for action in &mut self.actions {
-            action.fill(0.0);
-        }
-        self.history.reset();
+            ranges,
+            pushes: ranges.push.map(Pushes::Random),
+        };
+        self.subject
+            .place(&setting.kind, stage, conditions, &mut self.rng);
         self.left = setting.config.episode_frames;
         self.age = 0;
-        self.observe(setting);
+        self.subject.observe();
+    }
+
+    fn next_goal(&mut self, setting: &Setting) {
+        let (library, goals) = (&setting.library, &mut self.goals);
+        goals.next(library, &mut self.subject.goal);
+        self.subject
+            .look_ahead(|ahead, goal| goals.peek(library, ahead, goal));
     }
 
     /// One control period with `action` (policy units). An episode that ends is followed by the next one's start.
@@ -226,30 +157,23 @@ impl Environment {
         action: &[f32],
         slots: &mut Slots<'_>,
     ) {
-        self.push(setting);
-        self.set_targets(setting, action);
-        let targets = Targets {
-            goal: &self.goal,
-            legs: &self.legs,
-        };
-        stage.step(&mut self.body, &targets);
+        self.subject
+            .execute(&setting.kind, stage, action, &mut self.rng);
         self.age += 1;
         self.left = self.left.saturating_sub(1);
         let time_out = (self.left == 0).then_some(EndReason::TimedOut);
-        let end = setting.fall(self.body.reading()).or(time_out);
+        let end = setting.fall(self.subject.body.reading()).or(time_out);
         self.judge(setting, action, slots);
         *slots.end = end;
         *slots.length = self.age;
-
         if !matches!(end, Some(EndReason::Diverged(_))) {
-            self.history.set_last_action(action);
-            self.actions.swap(0, 1);
-            self.actions[0].copy_from_slice(action);
-            self.goals.next(&setting.library, &mut self.goal);
-            self.observe(setting);
+            self.subject.remember(action);
+            self.next_goal(setting);
+            self.subject.observe();
         }
         if end.is_some() {
-            self.write_privileged(setting, slots.final_privileged);
+            self.subject
+                .write_privileged(&setting.kind, slots.final_privileged);
             self.reset(setting, stage);
         }
         self.write(setting, slots.observation, slots.privileged);
@@ -257,82 +181,30 @@ impl Environment {
 
     /// Writes what the policy and the critic see now.
     pub(super) fn write(&self, setting: &Setting, observation: &mut [f32], privileged: &mut [f32]) {
-        observation.copy_from_slice(self.history.stack());
-        self.write_privileged(setting, privileged);
+        observation.copy_from_slice(self.subject.history.stack());
+        self.subject.write_privileged(&setting.kind, privileged);
     }
 
     /// Whether it has the shape of `other`, as every environment of one robot and setting does.
     pub(super) fn is_like(&self, other: &Self) -> bool {
-        let shape = |environment: &Self| {
-            (
-                environment.history.stack().len(),
-                environment.goal.len(),
-                environment.parameters.len(),
-                environment.body.reading().joint_positions.len(),
-            )
-        };
-        shape(self) == shape(other)
-    }
-
-    fn push(&mut self, setting: &Setting) {
-        let (Some(push), Some(interval)) = (setting.randomization.push, setting.push_interval)
-        else {
-            return;
-        };
-        if self.until_push > 0 {
-            self.until_push -= 1;
-            return;
-        }
-        self.until_push = interval.saturating_sub(1);
-        let [linear, angular] = push.draw(&mut self.rng);
-        self.body.push(linear, angular);
-    }
-
-    fn set_targets(&mut self, setting: &Setting, action: &[f32]) {
-        let noise = setting.randomization.action;
-        leg_targets(&setting.robot, action, noise, &mut self.rng, &mut self.legs);
+        self.subject.is_like(&other.subject)
     }
 
     /// Writes the reward of the control period that just ended: the weighted terms' sum times its length.
     fn judge(&self, setting: &Setting, action: &[f32], slots: &mut Slots<'_>) {
+        let (kind, reading) = (&setting.kind, self.subject.body.reading());
+        let [last, before] = &self.subject.actions;
         let mut terms = [0.0; REWARD_TERMS];
-        if self.body.reading().divergence.is_none() {
+        if reading.divergence.is_none() {
             terms = setting.config.rewards.terms(&Outcome {
-                reading: self.body.reading(),
-                standing_height: setting.standing_height,
-                leg_default: &setting.leg_default,
-                action_scale: setting.robot.action_scale(),
-                actions: [action, &self.actions[0], &self.actions[1]],
+                reading,
+                standing_height: kind.standing_height,
+                leg_default: &kind.leg_default,
+                action_scale: kind.robot.action_scale(),
+                actions: [action, last, before],
             });
         }
-        *slots.reward = (terms.iter().sum::<f64>() / setting.robot.control_rate_hz()) as f32;
+        *slots.reward = (terms.iter().sum::<f64>() / kind.robot.control_rate_hz()) as f32;
         slots.terms.copy_from_slice(&terms);
-    }
-
-    /// Adds the present frame to the history.
-    fn observe(&mut self, setting: &Setting) {
-        for (ahead, goal) in AHEAD.into_iter().zip(&mut self.ahead) {
-            self.goals.peek(&setting.library, ahead, goal);
-        }
-        let reading = self.body.reading();
-        let state = RobotState {
-            joint_positions: &reading.joint_positions,
-            orientation: reading.orientation,
-        };
-        self.history.push(&state, &self.goal);
-    }
-
-    fn write_privileged(&self, setting: &Setting, out: &mut [f32]) {
-        let state = PrivilegedState {
-            reading: self.body.reading(),
-            frame: self.history.newest(),
-            action_before: &self.actions[1],
-            goal: &self.goal,
-            goals_ahead: [&self.ahead[0], &self.ahead[1]],
-            parameters: &self.parameters,
-            standing_height: setting.standing_height,
-            weight: setting.mass * GRAVITY,
-        };
-        setting.privileged.write(&state, out);
     }
 }

@@ -9,6 +9,7 @@ mod episode;
 mod privileged;
 mod randomization;
 mod rewards;
+mod subject;
 #[cfg(test)]
 mod tests;
 mod vec;
@@ -17,6 +18,7 @@ pub use config::EnvironmentConfig;
 pub use episode::EndReason;
 pub use privileged::PrivilegedLayout;
 pub use randomization::{Hang, MassRange, Push, Randomization};
-pub(crate) use randomization::{leg_targets, within};
+pub(crate) use randomization::{check_range, leg_targets, within};
 pub use rewards::{REWARD_NAMES, REWARD_TERMS, RewardWeights};
+pub(crate) use subject::{Conditions, Kind, Subject};
 pub use vec::{Step, VecEnvironment};

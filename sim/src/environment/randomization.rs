@@ -284,18 +284,30 @@ impl Randomization {
             ),
         ];
         for (name, range, least, most) in rows {
-            let Some([low, high]) = range else { continue };
-            // Comparisons with NaN are false.
-            if !(least <= low && low <= high && high <= most) {
-                return Err(SimError::Setting {
-                    name: format!("randomization.{name}"),
-                    expected: format!("a range from low to high within {least:e} and {most:e}"),
-                    found: format!("{low} to {high}"),
-                });
+            if let Some(range) = range {
+                check_range(&format!("randomization.{name}"), range, least, most)?;
             }
         }
         Ok(())
     }
+}
+
+/// Refuses a setting that is no range from low to high within these bounds.
+pub(crate) fn check_range(
+    name: &str,
+    [low, high]: [f64; 2],
+    least: f64,
+    most: f64,
+) -> Result<(), SimError> {
+    // Comparisons with NaN are false.
+    if least <= low && low <= high && high <= most {
+        return Ok(());
+    }
+    Err(SimError::Setting {
+        name: name.to_owned(),
+        expected: format!("a range from low to high within {least:e} and {most:e}"),
+        found: format!("{low} to {high}"),
+    })
 }
 
 /// A number from `range`, or `nominal` where there is none; draws one from `rng` either way.

@@ -179,7 +179,7 @@ fn an_episode_ends_by_tilt_height_or_divergence() {
     for_each_robot(|robot| {
         let library = Arc::new(goal_library(robot));
         let robot = Arc::new(Robot::load(&crate::testing::folder(robot.name())).unwrap());
-        let setting = Setting::new(robot.clone(), EnvironmentConfig::default(), library, 30);
+        let setting = Setting::new(robot.clone(), EnvironmentConfig::default(), library);
         let end = |roll: f64, pitch: f64, height: f64| {
             let mut reading = still(&robot);
             reading.orientation = UnitQuaternion::from_euler_angles(roll, pitch, 2.0);

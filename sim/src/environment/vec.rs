@@ -69,8 +69,7 @@ impl VecEnvironment {
                 found: library.joints().to_string(),
             });
         }
-        let bodies = robot.model().body_mass().len();
-        let setting = Setting::new(robot, config, library, bodies);
+        let setting = Setting::new(robot, config, library);
         let count = environments.end.saturating_sub(environments.start) as usize;
         let mut made: Vec<Option<Environment>> = (0..count).map(|_| None).collect();
         pool.for_each(made.par_iter_mut().enumerate(), |stage, (index, slot)| {
@@ -99,7 +98,7 @@ impl VecEnvironment {
 
     /// The robot.
     pub fn robot(&self) -> &Arc<Robot> {
-        &self.setting.robot
+        &self.setting.kind.robot
     }
 
     /// The settings.
@@ -109,12 +108,12 @@ impl VecEnvironment {
 
     /// Where each part of an observation stands.
     pub fn layout(&self) -> &ObservationLayout {
-        &self.setting.observation
+        &self.setting.kind.observation
     }
 
     /// Where each part of a privileged observation stands.
     pub fn privileged_layout(&self) -> &PrivilegedLayout {
-        &self.setting.privileged
+        &self.setting.kind.privileged
     }
 
     /// The stacks `S_t`, N × [`ObservationLayout::width`].
@@ -132,7 +131,7 @@ impl VecEnvironment {
     pub fn set_curriculum(&mut self, randomization: f64, difficulty: f32) {
         let setting = &mut self.setting;
         let full = setting.config.randomization;
-        setting.randomization = full.scaled(&setting.robot, randomization);
+        setting.randomization = full.scaled(&setting.kind.robot, randomization);
         setting.difficulty = difficulty;
     }
 
@@ -142,15 +141,15 @@ impl VecEnvironment {
     /// If there is not one row of actions an environment.
     pub fn step(&mut self, actions: &[f32]) -> Step<'_> {
         let (setting, batch) = (&self.setting, &mut self.batch);
-        let legs = setting.observation.last_action().len();
+        let legs = setting.kind.observation.last_action().len();
         assert_eq!(actions.len(), legs * self.environments.len(), "actions");
-        let privileged = setting.privileged.width();
+        let privileged = setting.kind.privileged.width();
         let rows = (
             self.environments.par_iter_mut(),
             actions.par_chunks_exact(legs),
             batch
                 .observations
-                .par_chunks_exact_mut(setting.observation.width()),
+                .par_chunks_exact_mut(setting.kind.observation.width()),
             batch.privileged.par_chunks_exact_mut(privileged),
             batch.final_privileged.par_chunks_exact_mut(privileged),
             batch.rewards.par_iter_mut(),
@@ -227,11 +226,11 @@ impl VecEnvironment {
         let observations = self
             .batch
             .observations
-            .chunks_exact_mut(self.setting.observation.width());
+            .chunks_exact_mut(self.setting.kind.observation.width());
         let privileged = self
             .batch
             .privileged
-            .chunks_exact_mut(self.setting.privileged.width());
+            .chunks_exact_mut(self.setting.kind.privileged.width());
         for ((environment, observation), privileged) in
             self.environments.iter().zip(observations).zip(privileged)
         {
@@ -242,9 +241,9 @@ impl VecEnvironment {
 
 impl Batch {
     fn new(setting: &Setting, count: usize) -> Self {
-        let privileged = vec![0.0; count * setting.privileged.width()];
+        let privileged = vec![0.0; count * setting.kind.privileged.width()];
         Self {
-            observations: vec![0.0; count * setting.observation.width()],
+            observations: vec![0.0; count * setting.kind.observation.width()],
             final_privileged: privileged.clone(),
             privileged,
             rewards: vec![0.0; count],

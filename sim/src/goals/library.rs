@@ -1,9 +1,9 @@
 //! Many clips, to draw training goals from.
 
-use emp_robot::{JointMirror, Robot};
+use emp_robot::Robot;
 use rand::{Rng, RngExt as _};
 
-use super::stream::Piece;
+use super::piece::{GoalJoint, Piece, check_clips};
 use super::{GoalClip, GoalError, GoalStatistics, GoalStream, Source};
 
 /// Frames of a piece, as in the paper (section VI).
@@ -25,19 +25,9 @@ pub struct GoalLibrary {
     clips: Vec<Entry>,
     /// Recorded and procedural clips, those of the two that there are; each is drawn from as often as the other.
     groups: Vec<Group>,
-    pub(super) joints: Vec<Joint>,
+    pub(super) joints: Vec<GoalJoint>,
     /// Control period, seconds.
     pub(super) period: f32,
-}
-
-/// What the stream has to know of a goal joint.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Joint {
-    pub(super) range: [f32; 2],
-    default: f32,
-    /// Whose angle it takes in the mirror, and with what sign.
-    partner: usize,
-    sign: f32,
 }
 
 #[derive(Debug)]
@@ -61,17 +51,7 @@ impl GoalLibrary {
     /// # Errors
     /// If there is no clip, one has another number of joints than the robot, or the robot has no mirror image.
     pub fn new(robot: &Robot, clips: Vec<GoalClip>) -> Result<Self, GoalError> {
-        let expected = robot.goal_joints().len();
-        if clips.is_empty() {
-            return Err(GoalError::NoClip);
-        }
-        if let Some(clip) = clips.iter().find(|clip| clip.joints() != expected) {
-            return Err(GoalError::Joints {
-                clip: clip.name.clone(),
-                expected,
-                found: clip.joints(),
-            });
-        }
+        check_clips(robot, &clips)?;
         let groups =
             [Source::Recorded, Source::Procedural].map(|source| Group::new(&clips, source));
         let tempo = |clip: &GoalClip| match clip.source {
@@ -80,7 +60,7 @@ impl GoalLibrary {
         };
         Ok(Self {
             groups: groups.into_iter().flatten().collect(),
-            joints: joints(robot, &robot.mirror()?),
+            joints: GoalJoint::all(robot)?,
             period: (1.0 / robot.control_rate_hz()) as f32,
             clips: clips
                 .into_iter()
@@ -130,12 +110,11 @@ impl GoalLibrary {
         let clip = group.draw(rng);
         let Entry { clip: goals, tempo } = &self.clips[clip];
         let tempo = rng.random_range(tempo[0]..=tempo[1]);
-        let last = (goals.len() - 1) as f64;
-        let frames = PIECE.min((last / f64::from(tempo)) as usize + 1);
-        let spare = last - (frames - 1) as f64 * f64::from(tempo);
+        let frames = Piece::periods(goals.len(), tempo, PIECE);
+        let spare = Piece::spare(goals.len(), tempo, frames);
         Piece {
             clip,
-            start: rng.random_range(0.0..=spare.max(0.0)),
+            start: rng.random_range(0.0..=spare),
             tempo,
             frames,
             amplitude: difficulty * rng.random_range(LEAST_AMPLITUDE..=1.0),
@@ -145,18 +124,7 @@ impl GoalLibrary {
 
     /// The goal of frame `t` of a piece.
     pub(super) fn goal(&self, piece: &Piece, t: usize, out: &mut [f32]) {
-        let clip = &self.clips[piece.clip].clip;
-        let at = piece.start + t as f64 * f64::from(piece.tempo);
-        if piece.mirrored {
-            clip.interpolate(at, |joint| self.joints[joint].partner, out);
-        } else {
-            clip.interpolate(at, |joint| joint, out);
-        }
-        for (out, joint) in out.iter_mut().zip(&self.joints) {
-            let sign = if piece.mirrored { joint.sign } else { 1.0 };
-            let offset = piece.amplitude * (sign * *out - joint.default);
-            *out = (joint.default + offset).clamp(joint.range[0], joint.range[1]);
-        }
+        piece.goal(&self.clips[piece.clip].clip, &self.joints, t, out);
     }
 }
 
@@ -182,17 +150,6 @@ impl Group {
         let drawn = rng.random_range(0..total);
         self.clips[self.cumulative.partition_point(|&sum| sum <= drawn)]
     }
-}
-
-fn joints(robot: &Robot, mirror: &JointMirror) -> Vec<Joint> {
-    let goal = robot.goal_joints().iter().enumerate();
-    goal.map(|(i, joint)| Joint {
-        range: joint.range.map(|limit| limit as f32),
-        default: joint.default as f32,
-        partner: mirror.permutation()[i],
-        sign: mirror.signs()[i],
-    })
-    .collect()
 }
 
 fn is_slow(robot: &Robot, clip: &GoalClip) -> bool {

@@ -2,6 +2,7 @@
 
 mod clip;
 mod library;
+mod piece;
 mod statistics;
 mod stream;
 
@@ -10,6 +11,7 @@ use emp_robot::RobotError;
 
 pub use clip::{GoalClip, Source};
 pub use library::GoalLibrary;
+pub(crate) use piece::{GoalJoint, Piece, check_clips};
 pub use statistics::{GoalStatistics, Spread};
 pub use stream::GoalStream;
 

@@ -5,6 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::GoalLibrary;
+use super::piece::Piece;
 
 /// Peak joint speeds of the movement from one piece to the next, rad/s: from leisurely to brisk.
 const JOIN_SPEED: [f32; 2] = [1.0, 4.0];
@@ -29,22 +30,6 @@ pub struct GoalStream {
     given: usize,
     current: Segment,
     next: Segment,
-}
-
-/// A piece of a clip as it is played.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Piece {
-    /// Index of the clip in the library.
-    pub(super) clip: usize,
-    /// Where it starts in the clip, frames.
-    pub(super) start: f64,
-    /// Frames of the clip in one control period.
-    pub(super) tempo: f32,
-    /// Control periods, at least 1.
-    pub(super) frames: usize,
-    /// Factor on the distance from the default pose.
-    pub(super) amplitude: f32,
-    pub(super) mirrored: bool,
 }
 
 /// A movement to a piece, then the piece.

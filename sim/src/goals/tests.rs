@@ -174,7 +174,7 @@ fn a_mirrored_piece_is_the_mirrored_clip() {
         let clip = swing(robot, Source::Recorded, 100, 0.3, 0.5);
         let image = clip.mirrored(&robot.mirror().unwrap());
         let library = GoalLibrary::new(robot, vec![clip]).unwrap();
-        let piece = stream::Piece {
+        let piece = Piece {
             clip: 0,
             start: 10.0,
             tempo: 1.0,

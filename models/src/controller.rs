@@ -10,6 +10,7 @@ use crate::{
     ModelError,
     emp::Emp,
     filters::{self, FilterError},
+    guard::{Execution, ExecutionGuard},
     observation::{History, ObservationLayout, RobotState},
     policy::Policy,
 };
@@ -55,6 +56,8 @@ pub struct Risk {
 pub struct ControllerState {
     history: History,
     filter_memory: Vec<f32>,
+    /// What comes between the filter and the joints; none where the robot's goals are executed as the filter leaves them.
+    guard: Option<ExecutionGuard>,
 }
 
 impl ControllerState {
@@ -63,13 +66,29 @@ impl ControllerState {
         Self {
             history: History::new(layout),
             filter_memory: Vec::new(),
+            guard: None,
         }
+    }
+
+    /// The same robot with a guard between its goal filter and its joints.
+    #[must_use]
+    pub fn with_guard(self, guard: ExecutionGuard) -> Self {
+        let guard = Some(guard);
+        Self { guard, ..self }
+    }
+
+    /// The guard between the goal filter and the joints.
+    pub fn guard_mut(&mut self) -> Option<&mut ExecutionGuard> {
+        self.guard.as_mut()
     }
 
     /// Forgets everything: the next step is the first of an episode.
     pub fn reset(&mut self) {
         self.history.reset();
         self.filter_memory.clear();
+        if let Some(guard) = &mut self.guard {
+            guard.restart();
+        }
     }
 
     /// The last frames.
@@ -108,19 +127,24 @@ pub struct ControllerOutput {
     pub leg_targets: Vec<f32>,
     /// How dangerous the filter finds the goal; none without an EMP.
     pub risk: Option<Risk>,
+    /// What the guard did; none for a robot without one.
+    pub execution: Option<Execution>,
 }
 
-/// A goal that went through a filter.
+/// A goal that went through a filter and, where the robot has one, its guard.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilteredGoal {
     /// The goal to execute: angles of the goal joints, rad.
     pub goal: Vec<f32>,
     /// How dangerous the filter finds the goal that was asked for; none without an EMP.
     pub risk: Option<Risk>,
+    /// What the guard did; none for a robot without one.
+    pub execution: Option<Execution>,
 }
 
 /// A controller up to its policy: adds a control period to each robot's history and puts its goal through a filter. The
-/// newest frame of a history then holds the goal to execute (erratum E9).
+/// newest frame of a history then holds the goal to execute (erratum E9), which is what a robot's guard leaves of the
+/// filter's answer.
 ///
 /// # Errors
 /// [`ModelError::Frame`] if an input has another number of joints than `layout`, before any state has changed; when a model
@@ -139,22 +163,26 @@ pub fn filter_goals(
     let asked = batch.iter().map(|(_, input)| FilteredGoal {
         goal: input.goal.to_vec(),
         risk: None,
+        execution: None,
     });
     let mut goals: Vec<FilteredGoal> = asked.collect();
-    let Some(filter) = filter else {
-        return Ok(goals);
-    };
-    let robots = batch.iter_mut().zip(&mut goals);
-    let mut items: Vec<FilterItem<'_>> = robots
-        .map(|((robot, _), FilteredGoal { goal, risk })| FilterItem {
-            observation: robot.history.stack(),
-            goal,
-            memory: &mut robot.filter_memory,
-            risk,
-        })
-        .collect();
-    filter.filter(&mut items)?;
-    for ((robot, _), filtered) in batch.iter_mut().zip(&goals) {
+    if let Some(filter) = filter {
+        let robots = batch.iter_mut().zip(&mut goals);
+        let mut items: Vec<FilterItem<'_>> = robots
+            .map(|((robot, _), filtered)| FilterItem {
+                observation: robot.history.stack(),
+                goal: &mut filtered.goal,
+                memory: &mut robot.filter_memory,
+                risk: &mut filtered.risk,
+            })
+            .collect();
+        filter.filter(&mut items)?;
+    }
+    for ((robot, input), filtered) in batch.iter_mut().zip(&mut goals) {
+        if let Some(guard) = &mut robot.guard {
+            let measured = &input.state.joint_positions[..input.goal.len()];
+            filtered.execution = Some(guard.step(measured, input.goal, &mut filtered.goal));
+        }
         robot.history.set_newest_goal(&filtered.goal);
     }
     Ok(goals)
@@ -254,13 +282,19 @@ impl Controller {
         let answers = batch.iter_mut().zip(goals);
         Ok(answers
             .zip(actions.chunks_exact(legs))
-            .map(|(((robot, _), FilteredGoal { goal, risk }), action)| {
+            .map(|(((robot, _), filtered), action)| {
                 robot.history.set_last_action(action);
+                let FilteredGoal {
+                    goal,
+                    risk,
+                    execution,
+                } = filtered;
                 ControllerOutput {
                     goal,
                     action: action.to_vec(),
                     leg_targets: self.policy.leg_targets(action),
                     risk,
+                    execution,
                 }
             })
             .collect())

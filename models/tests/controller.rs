@@ -1,6 +1,6 @@
 //! The controller: order of things in a control period, batches, refusals.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use candle_core::{DType, Device};
 use candle_nn::{VarBuilder, VarMap};
@@ -8,6 +8,7 @@ use emp_models::{
     ModelError,
     checkpoint::Tensors,
     controller::{Controller, ControllerInput, ControllerState, FilterItem, GoalFilter},
+    guard::{ExecutionGuard, GuardSettings},
     observation::RobotState,
     policy::{Mlp, Normalizer, Policy, PolicyConfig},
 };
@@ -106,6 +107,64 @@ fn the_filtered_goal_is_executed_observed_and_remembered() {
         .step(&mut [(&mut state, input(&[0.1; 27], &[0.2; 15], 0.05))])
         .expect("an answer");
     assert_eq!(answers[0].goal, [1.2; 15], "the filter's memory went too");
+}
+
+/// Asks for twice the angle.
+struct Doubling;
+
+impl GoalFilter for Doubling {
+    fn name(&self) -> &'static str {
+        "doubling"
+    }
+
+    fn filter(&self, batch: &mut [FilterItem<'_>]) -> Result<(), ModelError> {
+        for item in batch {
+            item.goal.iter_mut().for_each(|angle| *angle *= 2.0);
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn what_the_guard_leaves_is_executed_and_observed() {
+    let policy = policy();
+    let robot = Arc::clone(policy.robot());
+    let controller = Controller::new(policy, Some(Arc::new(Doubling)));
+    let layout = *controller.policy().layout();
+    let settings = GuardSettings {
+        ramp: Duration::from_millis(100),
+        stale_after: Duration::from_secs(1),
+        return_after: Duration::from_secs(1),
+    };
+    let mut state = controller
+        .state()
+        .with_guard(ExecutionGuard::new(&robot, &settings));
+    let positions = [0.0; 27];
+    let mut goal = [0.0; 15];
+    goal[0] = 0.1;
+    let mut run = |goal: &[f32], periods: usize| {
+        let mut executed = Vec::new();
+        for _ in 0..periods {
+            let answer = controller
+                .step(&mut [(&mut state, input(&positions, goal, 0.0))])
+                .expect("an answer")
+                .remove(0);
+            assert_eq!(state.history().newest()[layout.goal()], answer.goal);
+            executed.push((answer.goal[0], answer.execution.expect("a guard")));
+        }
+        executed
+    };
+    let executed = run(&goal, 6);
+    assert_eq!(executed[0].0, 0.1, "the correction fades in");
+    assert_eq!(executed[0].1.fade, Some(0.0));
+    assert_eq!(executed[5].0, 0.2);
+    assert_eq!(executed[5].1.fade, None);
+    goal[0] = 0.6;
+    let executed = run(&goal, 1);
+    let step = (robot.goal_joints()[0].velocity_limit / robot.control_rate_hz()) as f32;
+    assert!((executed[0].0 - (0.2 + step)).abs() < 1e-6);
+    assert_eq!(executed[0].1.limited, [0]);
+    assert_eq!(executed[0].1.wanted[0], 1.2);
 }
 
 #[test]

@@ -31,6 +31,8 @@ struct Fade {
 pub struct Execution {
     /// While one correction of the goal is exchanged for another: the share of the time that has passed, 0 to 1.
     pub fade: Option<f32>,
+    /// The goal before speeds were limited, rad.
+    pub wanted: Vec<f32>,
     /// Goal joints, by index, whose speed was limited.
     pub limited: Vec<usize>,
 }
@@ -72,12 +74,18 @@ impl ExecutionGuard {
             self.begin_fade(asked, goal);
         }
         let fade = self.fade(goal);
-        let limited = self.limit(goal);
+        goal.copy_from_slice(&self.limits.inside(goal));
+        let wanted = goal.to_vec();
+        let limited = self.limit_speeds(goal);
         self.executed.copy_from_slice(goal);
         for ((correction, goal), asked) in self.correction.iter_mut().zip(goal).zip(asked) {
             *correction = *goal - asked;
         }
-        Execution { fade, limited }
+        Execution {
+            fade,
+            wanted,
+            limited,
+        }
     }
 
     fn begin_fade(&mut self, asked: &[f32], goal: &[f32]) {
@@ -100,14 +108,13 @@ impl ExecutionGuard {
         Some(progress)
     }
 
-    fn limit(&self, goal: &mut [f32]) -> Vec<usize> {
-        let Limits { steps, ranges, .. } = &self.limits;
-        let joints = goal.iter_mut().zip(&self.executed).zip(steps).zip(ranges);
+    fn limit_speeds(&self, goal: &mut [f32]) -> Vec<usize> {
+        let joints = goal.iter_mut().zip(&self.executed).zip(&self.limits.steps);
         let mut limited = Vec::new();
-        for (index, (((goal, last), step), [lower, upper])) in joints.enumerate() {
-            let inside = goal.clamp(*lower, *upper);
-            *goal = inside.clamp(last - step, last + step);
-            if *goal != inside {
+        for (index, ((goal, last), step)) in joints.enumerate() {
+            let wanted = *goal;
+            *goal = wanted.clamp(last - step, last + step);
+            if *goal != wanted {
                 limited.push(index);
             }
         }

@@ -12,6 +12,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 ///   emp retarget walk.bvh --robot emp27 --refine --smooth --out joints.csv
 ///   emp retarget walk.bvh --robot emp27 --realtime --out joints.csv
 ///   emp evaluate --robot emp27 --motions recordings/ --procedural 100 --csv episodes.csv
+///   emp evaluate --robot emp27 --motions recordings/ --controller emp --amplitude 1.5
 ///
 /// Exit codes: 0 done; 1 failed (whatever was received is written); 2 wrong usage; 3 done, but frames are missing though
 /// every frame was asked for; 130 interrupted (Ctrl-C; whatever was received is written).
@@ -91,8 +92,8 @@ pub(crate) struct Evaluate {
     /// Name of the robot, as `emp robots` lists it
     #[arg(long, value_name = "NAME")]
     pub(crate) robot: String,
-    /// `decoupled`, or a filter of goals before the policy, with parameters as `NAME:key=value,…`; an unknown one is
-    /// answered with those that there are
+    /// `decoupled`, `emp`, `emp-when-danger`, or another filter of goals before the policy, with parameters as
+    /// `NAME:key=value,…`; an unknown one is answered with those that there are
     #[arg(long, value_name = "NAME", default_value = "decoupled")]
     pub(crate) controller: String,
     /// Folders (searched recursively) or files of recorded motion: BVH, AMASS, key nodes

@@ -4,15 +4,16 @@ use std::time::{Duration, Instant};
 
 use emp_motion::{Clip, KeyNodeFrame};
 use emp_proto::v1::{
-    CollectRolloutsConfig, EvaluateConfig, GetModelRequest, GetRobotRequest, GoalClip,
-    ListModelsRequest, Model, RetargetRequest, Robot, model_service_client::ModelServiceClient,
-    motion_service_client::MotionServiceClient,
+    CollectRolloutsConfig, EvaluateConfig, FilterGoalRequest, GetModelRequest, GetRobotRequest,
+    GoalClip, ListModelsRequest, Model, RetargetRequest, Robot,
+    model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
 };
 use tonic::transport::{Channel, Endpoint};
 
 use crate::{
-    Answer, Backoff, ClientError, Collection, Evaluation, FrameSender, PolicyAnswer, PolicyConfig,
-    RobotFrame, StreamConfig, StreamEvents, driver, wire,
+    Answer, Backoff, ClientError, Collection, Evaluation, FilterAnswer, FilterConfig, FrameSender,
+    GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, RobotFrame, StreamConfig, StreamEvents,
+    driver, wire,
 };
 
 /// How long a connection may take to stand.
@@ -131,6 +132,53 @@ impl Client {
         &self,
         config: StreamConfig,
     ) -> Result<(FrameSender, StreamEvents), ClientError> {
+        driver::start(self.motion_service(), config, self.backoff).await
+    }
+
+    /// Filters one goal: moves it as far as the robot's state needs, and says how the robot stands with it. The answer's
+    /// number is 0. The config's delivery is that of streams.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn filter_goal(
+        &self,
+        config: &FilterConfig,
+        history: GoalHistory<'_>,
+    ) -> Result<FilterAnswer, ClientError> {
+        let request = FilterGoalRequest {
+            header: Some(wire::header(0, None)),
+            robot: config.robot.clone(),
+            model: config.model.clone(),
+            model_version: config.model_version.clone(),
+            history: history.frames.iter().map(wire::observation).collect(),
+            start_heading: history.start_heading,
+            emp_mode: config.emp_mode.into(),
+            last_applied: history.last_applied,
+        };
+        let sent = Instant::now();
+        let response = self.motion_service().filter_goal(request).await;
+        let response = response.map_err(ClientError::Status)?.into_inner();
+        let result = response
+            .result
+            .ok_or(ClientError::Contract("FilterGoal without a result"))?;
+        Ok(wire::filter_answer(
+            0,
+            result,
+            response.timing,
+            sent.elapsed(),
+        ))
+    }
+
+    /// Opens a stream of goals to filter, one a control period, for a robot whose legs the program moves itself. The first
+    /// frame starts an episode, and so does one with `reset`. A lost connection is restored as that of
+    /// [`Self::policy_stream`].
+    ///
+    /// # Errors
+    /// When the server refuses the stream.
+    pub async fn filter_stream(
+        &self,
+        config: FilterConfig,
+    ) -> Result<(FrameSender<GoalFrame>, StreamEvents<FilterAnswer>), ClientError> {
         driver::start(self.motion_service(), config, self.backoff).await
     }
 

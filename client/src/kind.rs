@@ -4,15 +4,20 @@ use std::{future::Future, time::Duration};
 
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{
-    Delivery, DroppedFrame, FrameHeader, RetargetFrame, RetargetedFrame, SteppedFrame,
-    StreamPolicyRequest, StreamPolicyResponse, StreamRetargetRequest, StreamRetargetResponse,
-    motion_service_client::MotionServiceClient, stream_policy_request, stream_policy_response,
+    Delivery, DroppedFrame, FilteredFrame, FrameHeader, RetargetFrame, RetargetedFrame,
+    SteppedFrame, StreamFilterGoalRequest, StreamFilterGoalResponse, StreamPolicyRequest,
+    StreamPolicyResponse, StreamRetargetRequest, StreamRetargetResponse,
+    motion_service_client::MotionServiceClient, stream_filter_goal_request,
+    stream_filter_goal_response, stream_policy_request, stream_policy_response,
     stream_retarget_request, stream_retarget_response,
 };
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming, transport::Channel};
 
-use crate::{Answer, ClientError, PolicyAnswer, PolicyConfig, RobotFrame, StreamConfig, wire};
+use crate::{
+    Answer, ClientError, FilterAnswer, FilterConfig, GoalFrame, PolicyAnswer, PolicyConfig,
+    RobotFrame, StreamConfig, wire,
+};
 
 /// A stream's config, which says of what kind the stream is.
 pub(crate) trait Kind: Clone + Send + Sync + 'static {
@@ -182,5 +187,65 @@ impl Kind for PolicyConfig {
             .result
             .ok_or(ClientError::Contract("an answer without a result"))?;
         Ok(wire::policy_answer(number, result, message.timing, latency))
+    }
+}
+
+impl Kind for FilterConfig {
+    type Frame = GoalFrame;
+    type Answer = FilterAnswer;
+    type Request = StreamFilterGoalRequest;
+    type Response = StreamFilterGoalResponse;
+    type Result = FilteredFrame;
+
+    fn first(&self) -> StreamFilterGoalRequest {
+        let message = stream_filter_goal_request::Message::Config(self.message());
+        StreamFilterGoalRequest {
+            message: Some(message),
+        }
+    }
+
+    fn delivery(&self) -> Delivery {
+        self.delivery
+    }
+
+    fn frame(header: FrameHeader, frame: &GoalFrame) -> StreamFilterGoalRequest {
+        let frame = wire::goal_frame(header, frame);
+        StreamFilterGoalRequest {
+            message: Some(stream_filter_goal_request::Message::Frame(frame)),
+        }
+    }
+
+    async fn call(
+        mut service: MotionServiceClient<Channel>,
+        requests: ReceiverStream<StreamFilterGoalRequest>,
+    ) -> Result<Streaming<StreamFilterGoalResponse>, Status> {
+        Ok(service.stream_filter_goal(requests).await?.into_inner())
+    }
+
+    fn sort(response: StreamFilterGoalResponse) -> Option<Incoming<Self>> {
+        use stream_filter_goal_response::Message;
+        Some(match response.message? {
+            Message::Started(started) => Incoming::Started(Started {
+                model: started.model,
+                model_version: started.model_version,
+                joint_names: [started.goal_joint_names, started.leg_joint_names].concat(),
+            }),
+            Message::Result(message) => Incoming::Result {
+                number: number(message.header),
+                message,
+            },
+            Message::Dropped(message) => Incoming::Dropped(message),
+        })
+    }
+
+    fn answer(
+        number: u64,
+        message: FilteredFrame,
+        latency: Duration,
+    ) -> Result<FilterAnswer, ClientError> {
+        let result = message
+            .result
+            .ok_or(ClientError::Contract("an answer without a result"))?;
+        Ok(wire::filter_answer(number, result, message.timing, latency))
     }
 }

@@ -1,4 +1,4 @@
-//! The client library: human poses and robot states go to a server of `emp.v1`, joint targets come back, by single calls
+//! The client library: human poses, goals and robot states go to a server of `emp.v1`, joint targets come back, by single calls
 //! or as a stream that survives a lost connection; controllers are evaluated there on a set of motions.
 //!
 //! It links neither MuJoCo nor candle and computes no joint angle: it installs in a minute on an operator's laptop.
@@ -42,11 +42,12 @@ mod wire;
 pub use backoff::Backoff;
 pub use client::Client;
 pub use emp_proto::v1::{
-    ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig, CollectStarted, Delivery,
-    DropReason, EpisodeEnd, EpisodeFinished, EpisodeMetrics, EpisodeResult, EvaluateConfig,
-    EvaluationMetrics, EvaluationResult, EvaluationStarted, GoalClip, GoalStatistics, Joint,
-    KeyNode, MassRange, Metric, Model, ProceduralClips, Push, Randomization, Robot, RolloutBlock,
-    Spread, StepEnd, TrainingEnd, evaluate_response::Message as EvaluationEvent,
+    ChangeReason, ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig,
+    CollectStarted, Delivery, DropReason, EmpMode, EpisodeEnd, EpisodeFinished, EpisodeMetrics,
+    EpisodeResult, EvaluateConfig, EvaluationMetrics, EvaluationResult, EvaluationStarted,
+    FilterResult, GoalClip, GoalStatistics, Joint, KeyNode, MassRange, Metric, Model,
+    ProceduralClips, Push, Randomization, Robot, RolloutBlock, Spread, StepEnd, TrainingEnd,
+    evaluate_response::Message as EvaluationEvent,
 };
 pub use error::ClientError;
 pub use rollouts::{Collection, Evaluation};
@@ -54,6 +55,7 @@ pub use statistics::{
     BatchStatistics, Counted, DirectionError, Percentiles, RetargetingSummary, Statistics, Summary,
 };
 pub use stream::{
-    Answer, AnswerTimes, DropCause, Dropped, Event, FrameSender, PolicyAnswer, PolicyConfig,
-    RobotFrame, StreamClosed, StreamConfig, StreamEvents,
+    Answer, AnswerTimes, DropCause, Dropped, Event, FilterAnswer, FilterConfig, FrameSender,
+    GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, RobotFrame, StreamClosed, StreamConfig,
+    StreamEvents,
 };

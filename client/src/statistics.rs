@@ -8,7 +8,7 @@ use std::{
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-use crate::{Answer, AnswerTimes, Event, PolicyAnswer};
+use crate::{Answer, AnswerTimes, Event, FilterAnswer, PolicyAnswer};
 
 /// Three significant digits, values clamped to a minute, in microseconds.
 const DIGITS: u8 = 3;
@@ -121,6 +121,12 @@ impl Counted for Answer {
 }
 
 impl Counted for PolicyAnswer {
+    fn times(&self) -> AnswerTimes {
+        self.times
+    }
+}
+
+impl Counted for FilterAnswer {
     fn times(&self) -> AnswerTimes {
         self.times
     }

@@ -3,7 +3,10 @@
 use std::time::Duration;
 
 use emp_motion::KeyNodeFrame;
-use emp_proto::v1::{Delivery, DropReason, StreamPolicyConfig, StreamRetargetConfig};
+use emp_proto::v1::{
+    Delivery, DropReason, EmpMode, FilterResult, StreamFilterGoalConfig, StreamPolicyConfig,
+    StreamRetargetConfig,
+};
 use nalgebra::UnitQuaternion;
 use tokio::sync::mpsc;
 
@@ -62,16 +65,19 @@ pub struct PolicyConfig {
     pub model_version: String,
     /// Whether every frame is computed, or only the newest.
     pub delivery: Delivery,
+    /// When the robot's EMP changes goals before the policy sees them; unspecified for never.
+    pub emp_mode: EmpMode,
 }
 
 impl PolicyConfig {
-    /// Every frame, with the robot's own policy.
+    /// Every frame, with the robot's own policy, goals as they are sent.
     pub fn for_robot(robot: impl Into<String>) -> Self {
         Self {
             robot: robot.into(),
             model: String::new(),
             model_version: String::new(),
             delivery: Delivery::All,
+            emp_mode: EmpMode::Off,
         }
     }
 
@@ -81,8 +87,85 @@ impl PolicyConfig {
             model: self.model.clone(),
             model_version: self.model_version.clone(),
             delivery: self.delivery.into(),
+            emp_mode: self.emp_mode.into(),
         }
     }
+}
+
+/// What holds for a whole stream of goals to filter, or for a single one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FilterConfig {
+    /// The robot's name.
+    pub robot: String,
+    /// The EMP's name; empty for the robot's own.
+    pub model: String,
+    /// The version that the EMP must have; empty for any.
+    pub model_version: String,
+    /// Whether every frame is computed, or only the newest.
+    pub delivery: Delivery,
+    /// When the EMP changes goals; unspecified for always.
+    pub emp_mode: EmpMode,
+}
+
+impl FilterConfig {
+    /// Every frame, always with the robot's own EMP.
+    pub fn for_robot(robot: impl Into<String>) -> Self {
+        Self {
+            robot: robot.into(),
+            model: String::new(),
+            model_version: String::new(),
+            delivery: Delivery::All,
+            emp_mode: EmpMode::On,
+        }
+    }
+
+    pub(crate) fn message(&self) -> StreamFilterGoalConfig {
+        StreamFilterGoalConfig {
+            robot: self.robot.clone(),
+            model: self.model.clone(),
+            model_version: self.model_version.clone(),
+            delivery: self.delivery.into(),
+            emp_mode: self.emp_mode.into(),
+        }
+    }
+}
+
+/// One control period of a robot whose legs are moved by the program: what it measures, what its upper body is asked to do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GoalFrame {
+    /// Angles of all joints, the goal joints before the leg joints, radians.
+    pub joint_positions: Vec<f32>,
+    /// Orientation of the base in a world frame with z up.
+    pub orientation: UnitQuaternion<f64>,
+    /// Angles that the goal joints are asked to take, radians.
+    pub goal: Vec<f32>,
+    /// The action of the control period before, one number a leg joint: (leg target − default angle) / the robot's action
+    /// scale; empty at the start of an episode.
+    pub last_action: Vec<f32>,
+    /// Whether this is the first control period of an episode.
+    pub reset: bool,
+}
+
+/// The last control periods of a robot, for a single call.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GoalHistory<'a> {
+    /// Oldest first; the last one is now, those before it have the goals that were executed.
+    pub frames: &'a [GoalFrame],
+    /// Yaw of the base when the episode started, radians; none for that of the oldest frame.
+    pub start_heading: Option<f32>,
+    /// Share of the EMP's correction that was executed in the control period before, 0 to 1.
+    pub last_applied: f32,
+}
+
+/// The answer to one goal.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FilterAnswer {
+    /// The frame's number, as [`FrameSender::send`] gave it.
+    pub sequence_number: u64,
+    /// What became of the goal.
+    pub result: FilterResult,
+    /// Where the time went.
+    pub times: AnswerTimes,
 }
 
 /// One control period of a robot: what it measures, and what its upper body is to do.
@@ -109,6 +192,8 @@ pub struct PolicyAnswer {
     pub action: Vec<f32>,
     /// Target angles of the leg joints, radians.
     pub leg_targets: Vec<f32>,
+    /// What became of the goal; none where the EMP is off.
+    pub filter: Option<FilterResult>,
     /// Where the time went.
     pub times: AnswerTimes,
 }

@@ -6,7 +6,9 @@ use emp_motion::{KeyNode, KeyNodeFrame};
 use emp_proto::v1;
 use nalgebra::{Rotation3, UnitQuaternion};
 
-use crate::stream::{Answer, AnswerTimes, DropCause, Dropped, PolicyAnswer, RobotFrame};
+use crate::stream::{
+    Answer, AnswerTimes, DropCause, Dropped, FilterAnswer, GoalFrame, PolicyAnswer, RobotFrame,
+};
 
 pub(crate) fn pose(frame: &KeyNodeFrame) -> v1::HumanPose {
     let position = |node: KeyNode| {
@@ -57,12 +59,34 @@ pub(crate) fn header(sequence_number: u64, time_budget: Option<Duration>) -> v1:
 pub(crate) fn robot_frame(header: v1::FrameHeader, frame: &RobotFrame) -> v1::PolicyFrame {
     v1::PolicyFrame {
         header: Some(header),
-        state: Some(v1::RobotState {
-            joint_positions: frame.joint_positions.clone(),
-            base_orientation: Some(quaternion(&frame.orientation.cast())),
-        }),
+        state: Some(state(&frame.joint_positions, &frame.orientation)),
         goal: frame.goal.clone(),
         reset: frame.reset,
+    }
+}
+
+pub(crate) fn goal_frame(header: v1::FrameHeader, frame: &GoalFrame) -> v1::FilterFrame {
+    v1::FilterFrame {
+        header: Some(header),
+        state: Some(state(&frame.joint_positions, &frame.orientation)),
+        goal: frame.goal.clone(),
+        last_action: frame.last_action.clone(),
+        reset: frame.reset,
+    }
+}
+
+pub(crate) fn observation(frame: &GoalFrame) -> v1::PolicyObservation {
+    v1::PolicyObservation {
+        state: Some(state(&frame.joint_positions, &frame.orientation)),
+        goal: frame.goal.clone(),
+        last_action: frame.last_action.clone(),
+    }
+}
+
+fn state(joint_positions: &[f32], orientation: &UnitQuaternion<f64>) -> v1::RobotState {
+    v1::RobotState {
+        joint_positions: joint_positions.to_vec(),
+        base_orientation: Some(quaternion(&orientation.cast())),
     }
 }
 
@@ -92,6 +116,20 @@ pub(crate) fn policy_answer(
         executable_goal: result.executable_goal,
         action: result.action,
         leg_targets: result.leg_targets,
+        filter: result.filter,
+        times: times(timing, latency),
+    }
+}
+
+pub(crate) fn filter_answer(
+    sequence_number: u64,
+    result: v1::FilterResult,
+    timing: Option<v1::Timing>,
+    latency: Duration,
+) -> FilterAnswer {
+    FilterAnswer {
+        sequence_number,
+        result,
         times: times(timing, latency),
     }
 }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use emp_models::{
-    controller::Controller,
+    emp::Emp,
     policy::Policy,
     retarget::{RetargetInput, RetargetOutput, Retargeter},
 };
@@ -15,10 +15,9 @@ use emp_proto::v1::{self, ModelKind};
 use emp_robot::{Robot, RobotError, robot_folders};
 
 use crate::{
-    backend::{
-        BackendError, Build, PolicyInput, PolicyOutput, first_then, policy_from, retargeter_from,
-    },
+    backend::{BackendError, Build, first_then, retargeter_from},
     batcher::{Batcher, Limits, ModelState},
+    control::{ControlInput, Controllers, FilterOutput, Filters, PolicyOutput},
     error::ServiceError,
     settings::{BatchingSettings, Settings},
     wire,
@@ -37,8 +36,11 @@ pub(crate) struct Served<I, O, M> {
 /// A retargeting model; the network itself where it is the shipped one.
 pub(crate) type RetargetModel = Served<RetargetInput, RetargetOutput, Option<Arc<Retargeter>>>;
 
-/// A policy.
-pub(crate) type PolicyModel = Served<PolicyInput, PolicyOutput, Controller>;
+/// A policy, alone and behind the robot's EMP, where it has one.
+pub(crate) type PolicyModel = Served<ControlInput, PolicyOutput, Controllers>;
+
+/// An EMP.
+pub(crate) type FilterModel = Served<ControlInput, FilterOutput, Filters>;
 
 /// Everything that is served, by name.
 #[derive(Default)]
@@ -46,6 +48,7 @@ pub struct Catalog {
     robots: BTreeMap<String, Arc<Robot>>,
     retargeters: BTreeMap<String, Arc<RetargetModel>>,
     policies: BTreeMap<String, Arc<PolicyModel>>,
+    filters: BTreeMap<String, Arc<FilterModel>>,
 }
 
 /// Why there is nothing to serve.
@@ -111,12 +114,18 @@ impl Catalog {
     /// Loads a robot's models, each on its own: one whose weights are not there is not served.
     fn load_models(&mut self, weights: &Path, robot: &Arc<Robot>, batching: &BatchingSettings) {
         let file = |model: &str| weights.join(format!("{}-{model}.safetensors", robot.name()));
+        let emp = self.load_emp(file("emp"), robot, batching);
+        let with_emp = emp.as_ref().ok().map(|emp| (Arc::clone(emp), file("emp")));
         let loaded = [
             (
                 "retargeter",
                 self.load_retargeter(file("retargeter"), robot, batching),
             ),
-            ("policy", self.load_policy(file("policy"), robot, batching)),
+            (
+                "policy",
+                self.load_policy(file("policy"), with_emp, robot, batching),
+            ),
+            ("emp", emp.map(drop)),
         ];
         for (model, loaded) in loaded {
             let weights = file(model);
@@ -152,9 +161,11 @@ impl Catalog {
         Ok(())
     }
 
+    /// `emp` is the robot's EMP and the file of its weights.
     fn load_policy(
         &mut self,
         weights: PathBuf,
+        emp: Option<(Arc<Emp>, PathBuf)>,
         robot: &Arc<Robot>,
         batching: &BatchingSettings,
     ) -> Result<(), CatalogError> {
@@ -166,14 +177,38 @@ impl Catalog {
             robot.leg_joints(),
             policy.metadata(),
         );
-        let controller = Controller::new(Arc::new(policy), None);
-        let build = first_then(controller.clone(), policy_from(weights, Arc::clone(robot)));
-        let served = serve(card, robot, batching, build, controller)?;
+        let (emp, emp_weights) = emp.unzip();
+        let controllers = Controllers::new(Arc::new(policy), emp);
+        let again = Controllers::load(weights, emp_weights, Arc::clone(robot));
+        let build = first_then(controllers.clone(), again);
+        let served = serve(card, robot, batching, build, controllers)?;
         self.robots
             .insert(robot.name().to_owned(), Arc::clone(robot));
         self.policies
             .insert(served.card.name.clone(), Arc::new(served));
         Ok(())
+    }
+
+    fn load_emp(
+        &mut self,
+        weights: PathBuf,
+        robot: &Arc<Robot>,
+        batching: &BatchingSettings,
+    ) -> Result<Arc<Emp>, CatalogError> {
+        let name = format!("{}-emp", robot.name());
+        let emp = Emp::load(&weights, Arc::clone(robot))
+            .map(Arc::new)
+            .map_err(failed(&name))?;
+        let card = wire::model_card(name, ModelKind::Emp, robot.goal_joints(), emp.metadata());
+        let filters = Filters::new(Arc::clone(&emp));
+        let again = Filters::load(weights, Arc::clone(robot));
+        let build = first_then(filters.clone(), again);
+        let served = serve(card, robot, batching, build, filters)?;
+        self.robots
+            .insert(robot.name().to_owned(), Arc::clone(robot));
+        self.filters
+            .insert(served.card.name.clone(), Arc::new(served));
+        Ok(emp)
     }
 
     /// Adds a retargeting model for a robot and starts its thread.
@@ -203,7 +238,8 @@ impl Catalog {
     pub(crate) fn cards(&self) -> Vec<&v1::Model> {
         let retargeters = self.retargeters.values().map(|model| &model.card);
         let policies = self.policies.values().map(|model| &model.card);
-        let mut cards: Vec<_> = retargeters.chain(policies).collect();
+        let filters = self.filters.values().map(|model| &model.card);
+        let mut cards: Vec<_> = retargeters.chain(policies).chain(filters).collect();
         cards.sort_by(|a, b| a.name.cmp(&b.name));
         cards
     }
@@ -214,7 +250,9 @@ impl Catalog {
         let retargeters = retargeters.map(|model| (model.card.name.clone(), model.batcher.state()));
         let policies = self.policies.values();
         let policies = policies.map(|model| (model.card.name.clone(), model.batcher.state()));
-        retargeters.chain(policies).collect()
+        let filters = self.filters.values();
+        let filters = filters.map(|model| (model.card.name.clone(), model.batcher.state()));
+        retargeters.chain(policies).chain(filters).collect()
     }
 
     /// The retargeter that a request or a stream's config asks for. Empty `model` and `version` take what there is.
@@ -243,6 +281,17 @@ impl Catalog {
     ) -> Result<&Arc<PolicyModel>, ServiceError> {
         self.robot_for(robot)?;
         choose(&self.policies, "robot with a policy", robot, model, version)
+    }
+
+    /// The EMP that a request or a stream's config asks for. Empty `model` and `version` take what there is.
+    pub(crate) fn filter_for(
+        &self,
+        robot: &str,
+        model: &str,
+        version: &str,
+    ) -> Result<&Arc<FilterModel>, ServiceError> {
+        self.robot_for(robot)?;
+        choose(&self.filters, "robot with an EMP", robot, model, version)
     }
 
     /// The robot that a request asks for.

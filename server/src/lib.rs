@@ -13,6 +13,7 @@ mod backend;
 mod batcher;
 mod catalog;
 mod check;
+mod control;
 mod deadline;
 mod error;
 mod models;

@@ -9,8 +9,9 @@ use std::{
 
 use emp_models::retarget::RetargetInput;
 use emp_proto::v1::{
-    FrameHeader, RetargetRequest, RetargetResponse, StepPolicyRequest, StepPolicyResponse,
-    StreamPolicyRequest, StreamRetargetRequest, motion_service_server::MotionService,
+    FilterGoalRequest, FilterGoalResponse, FrameHeader, RetargetRequest, RetargetResponse,
+    StepPolicyRequest, StepPolicyResponse, StreamFilterGoalRequest, StreamPolicyRequest,
+    StreamRetargetRequest, motion_service_server::MotionService,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::Stream;
@@ -21,12 +22,13 @@ use tracing::Instrument as _;
 use crate::{
     batcher::Batcher,
     catalog::Catalog,
+    control::{EmpMode, FilterOutput, PolicyOutput},
     deadline,
     error::{FieldError, ServiceError},
     pose,
     queue::{Answer, Priority},
-    robot_state,
-    session::{self, Kind, PolicyStream, RetargetStream, SessionContext},
+    robot_state::{self, Past},
+    session::{self, FilterStream, Kind, PolicyStream, RetargetStream, SessionContext},
     settings::StreamSettings,
     wire,
 };
@@ -36,7 +38,7 @@ const OUTBOUND: usize = 16;
 /// When to ask again for a stream; streams are long.
 const STREAM_RETRY: Duration = Duration::from_secs(1);
 
-/// Retargeting and leg targets, one frame or a stream of them.
+/// Retargeting, goal filters and leg targets, one frame or a stream of them.
 pub(crate) struct Motion {
     catalog: Arc<Catalog>,
     drain: CancellationToken,
@@ -108,15 +110,66 @@ impl Motion {
             model_version,
             history,
             start_heading,
+            emp_mode,
+            last_applied,
         } = request.into_inner();
         let model = self.catalog.policy_for(&robot, &model, &model_version)?;
-        let input = robot_state::read_history(&history, start_heading, &model.model)?;
+        let has_emp = model.model.emp().is_some();
+        let mode = robot_state::read_mode("emp_mode", emp_mode, EmpMode::Off, has_emp)?;
+        let past = Past {
+            history: &history,
+            start_heading,
+            last_applied,
+        };
+        let input = past.read(&model.robot, model.model.policy().layout(), mode)?;
         let deadline = due.with_frame(header.as_ref())?;
         let answer = compute(&model.batcher, input, deadline).await?;
         let timing = wire::timing(&answer);
+        let PolicyOutput {
+            output, assessment, ..
+        } = answer.output;
         Ok(StepPolicyResponse {
             header,
-            result: Some(wire::policy_result(answer.output.output)),
+            result: Some(wire::policy_result(&model.robot, mode, output, assessment)),
+            timing: Some(timing),
+        })
+    }
+
+    async fn filter_one(
+        &self,
+        request: Request<FilterGoalRequest>,
+    ) -> Result<FilterGoalResponse, ServiceError> {
+        let due = Due::of_call(request.metadata())?;
+        let FilterGoalRequest {
+            header,
+            robot,
+            model,
+            model_version,
+            history,
+            start_heading,
+            emp_mode,
+            last_applied,
+        } = request.into_inner();
+        let model = self.catalog.filter_for(&robot, &model, &model_version)?;
+        let mode = robot_state::read_mode("emp_mode", emp_mode, EmpMode::On, true)?;
+        let past = Past {
+            history: &history,
+            start_heading,
+            last_applied,
+        };
+        let input = past.read(&model.robot, model.model.layout(), mode)?;
+        let deadline = due.with_frame(header.as_ref())?;
+        let answer = compute(&model.batcher, input, deadline).await?;
+        let timing = wire::timing(&answer);
+        let FilterOutput {
+            filtered,
+            assessment,
+            ..
+        } = answer.output;
+        let result = wire::filter_result(&model.robot, filtered.goal, filtered.risk, assessment);
+        Ok(FilterGoalResponse {
+            header,
+            result: Some(result),
             timing: Some(timing),
         })
     }
@@ -222,6 +275,22 @@ impl MotionService for Motion {
         &self,
         request: Request<Streaming<StreamRetargetRequest>>,
     ) -> Result<Response<SessionStream<RetargetStream>>, Status> {
+        Ok(Response::new(self.open_session(request)?))
+    }
+
+    async fn filter_goal(
+        &self,
+        request: Request<FilterGoalRequest>,
+    ) -> Result<Response<FilterGoalResponse>, Status> {
+        Ok(Response::new(self.filter_one(request).await?))
+    }
+
+    type StreamFilterGoalStream = SessionStream<FilterStream>;
+
+    async fn stream_filter_goal(
+        &self,
+        request: Request<Streaming<StreamFilterGoalRequest>>,
+    ) -> Result<Response<SessionStream<FilterStream>>, Status> {
         Ok(Response::new(self.open_session(request)?))
     }
 

@@ -1,14 +1,19 @@
 //! A robot's state, goal and past off the wire: checked field by field against the robot.
 
 use emp_models::{
-    controller::{Controller, ControllerState},
-    observation::RobotState,
+    controller::ControllerState,
+    emp::EmpFilter,
+    observation::{ObservationLayout, RobotState},
 };
 use emp_proto::v1;
 use emp_robot::Robot;
 use nalgebra::UnitQuaternion;
 
-use crate::{backend::PolicyInput, check, error::FieldError};
+use crate::{
+    check,
+    control::{ControlInput, EmpMode},
+    error::FieldError,
+};
 
 /// What a robot measures and what it is to do, of one control period.
 #[derive(Debug, Clone, PartialEq)]
@@ -47,13 +52,14 @@ impl ControlPeriod {
     }
 
     /// This control period after `past`.
-    pub(crate) fn after(self, past: ControllerState) -> PolicyInput {
+    pub(crate) fn after(self, past: ControllerState, mode: EmpMode) -> ControlInput {
         let Self {
             joint_positions,
             orientation,
             goal,
         } = self;
-        PolicyInput {
+        ControlInput {
+            mode,
             state: past,
             joint_positions,
             orientation,
@@ -62,43 +68,89 @@ impl ControlPeriod {
     }
 }
 
-/// Reads the history of a unary call: the last of it is now, the others are the past.
-pub(crate) fn read_history(
-    history: &[v1::PolicyObservation],
-    start_heading: Option<f32>,
-    controller: &Controller,
-) -> Result<PolicyInput, FieldError> {
-    let (longest, given) = (controller.policy().layout().history(), history.len());
-    let Some((now, before)) = history.split_last() else {
-        return Err(FieldError::new(
-            "history",
-            format!("it is empty; expected 1 to {longest} control periods"),
-        ));
-    };
-    if given > longest {
-        return Err(FieldError::new(
-            "history",
-            format!("{given} control periods; expected 1 to {longest}"),
-        ));
-    }
-    let robot = controller.policy().robot();
-    let mut past = controller.state();
-    if let Some(heading) = start_heading {
-        if !heading.is_finite() {
-            let description = format!("{heading}; expected a finite number");
-            return Err(FieldError::new("start_heading", description));
+/// The mode that a field asks for; `default` where it asks for none.
+pub(crate) fn read_mode(
+    field: &str,
+    number: i32,
+    default: EmpMode,
+    has_emp: bool,
+) -> Result<EmpMode, FieldError> {
+    let mode = match v1::EmpMode::try_from(number) {
+        Ok(v1::EmpMode::Unspecified) => default,
+        Ok(v1::EmpMode::Off) => EmpMode::Off,
+        Ok(v1::EmpMode::On) => EmpMode::On,
+        Ok(v1::EmpMode::WhenDanger) => EmpMode::WhenDanger,
+        Err(_) => {
+            let description = format!("{number}; expected a value of emp.v1.EmpMode");
+            return Err(FieldError::new(field, description));
         }
-        past.history_mut().set_heading(f64::from(heading));
+    };
+    if mode != EmpMode::Off && !has_emp {
+        let description = "the robot has no EMP here; expected EMP_MODE_OFF";
+        return Err(FieldError::new(field, description));
     }
-    for (index, observation) in before.iter().enumerate() {
-        let period = read_observation(index, observation, robot, &mut past)?;
-        let state = RobotState {
-            joint_positions: &period.joint_positions,
-            orientation: period.orientation,
+    Ok(mode)
+}
+
+/// The part of a unary call that is about a robot's last control periods.
+pub(crate) struct Past<'a> {
+    /// The last of them is now, the others are the past.
+    pub(crate) history: &'a [v1::PolicyObservation],
+    pub(crate) start_heading: Option<f32>,
+    pub(crate) last_applied: f32,
+}
+
+impl Past<'_> {
+    /// Reads it for a model that sees a robot through `layout`.
+    pub(crate) fn read(
+        &self,
+        robot: &Robot,
+        layout: &ObservationLayout,
+        mode: EmpMode,
+    ) -> Result<ControlInput, FieldError> {
+        let (longest, given) = (layout.history(), self.history.len());
+        let Some((now, before)) = self.history.split_last() else {
+            return Err(FieldError::new(
+                "history",
+                format!("it is empty; expected 1 to {longest} control periods"),
+            ));
         };
-        past.history_mut().push(&state, &period.goal);
+        if given > longest {
+            return Err(FieldError::new(
+                "history",
+                format!("{given} control periods; expected 1 to {longest}"),
+            ));
+        }
+        let mut past = self.start(layout)?;
+        for (index, observation) in before.iter().enumerate() {
+            let period = read_observation(index, observation, robot, &mut past)?;
+            let state = RobotState {
+                joint_positions: &period.joint_positions,
+                orientation: period.orientation,
+            };
+            past.history_mut().push(&state, &period.goal);
+        }
+        Ok(read_observation(before.len(), now, robot, &mut past)?.after(past, mode))
     }
-    Ok(read_observation(before.len(), now, robot, &mut past)?.after(past))
+
+    /// The past before the first of its control periods.
+    fn start(&self, layout: &ObservationLayout) -> Result<ControllerState, FieldError> {
+        let mut past = ControllerState::new(*layout);
+        if let Some(heading) = self.start_heading {
+            if !heading.is_finite() {
+                let description = format!("{heading}; expected a finite number");
+                return Err(FieldError::new("start_heading", description));
+            }
+            past.history_mut().set_heading(f64::from(heading));
+        }
+        let applied = self.last_applied;
+        if !(0.0..=1.0).contains(&applied) {
+            let description = format!("{applied}; expected 0 to 1");
+            return Err(FieldError::new("last_applied", description));
+        }
+        past.set_filter_memory(EmpFilter::memory(applied));
+        Ok(past)
+    }
 }
 
 /// Reads one entry of a history and tells the past which action led to it.
@@ -115,17 +167,21 @@ fn read_observation(
         last_action,
     } = observation;
     let period = ControlPeriod::read(&prefix, state.as_ref(), goal, robot)?;
-    let legs = robot.leg_joints().len();
-    if last_action.is_empty() {
-        past.history_mut().set_last_action(&vec![0.0; legs]);
-    } else {
-        check::numbers(
-            &format!("{prefix}last_action"),
-            last_action,
-            legs,
-            "numbers",
-        )?;
-        past.history_mut().set_last_action(last_action);
-    }
+    let action = read_last_action(&format!("{prefix}last_action"), last_action, robot)?;
+    past.history_mut().set_last_action(&action);
     Ok(period)
+}
+
+/// The last action: all zero where there is none.
+pub(crate) fn read_last_action(
+    path: &str,
+    action: &[f32],
+    robot: &Robot,
+) -> Result<Vec<f32>, FieldError> {
+    let legs = robot.leg_joints().len();
+    if action.is_empty() {
+        return Ok(vec![0.0; legs]);
+    }
+    check::numbers(path, action, legs, "numbers")?;
+    Ok(action.to_vec())
 }

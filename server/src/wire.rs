@@ -2,11 +2,16 @@
 
 use std::time::Duration;
 
-use emp_models::{CheckpointMetadata, controller::ControllerOutput, retarget::AT_LIMIT};
+use emp_models::{
+    CheckpointMetadata,
+    assessment::{Assessment, Reason},
+    controller::{ControllerOutput, Risk},
+    retarget::AT_LIMIT,
+};
 use emp_proto::v1;
 use emp_robot::{Joint, Robot};
 
-use crate::queue::Answer;
+use crate::{control::EmpMode, queue::Answer};
 
 pub(crate) fn timing<O>(answer: &Answer<O>) -> v1::Timing {
     v1::Timing {
@@ -41,16 +46,58 @@ fn stands_at_limit(joint: &Joint, angle: f64) -> bool {
     angle <= lower + AT_LIMIT || angle >= upper - AT_LIMIT
 }
 
-pub(crate) fn policy_result(output: ControllerOutput) -> v1::PolicyResult {
+pub(crate) fn policy_result(
+    robot: &Robot,
+    mode: EmpMode,
+    output: ControllerOutput,
+    assessment: Assessment,
+) -> v1::PolicyResult {
     let ControllerOutput {
         goal,
         action,
         leg_targets,
+        risk,
+        ..
     } = output;
+    let filter =
+        (mode != EmpMode::Off).then(|| filter_result(robot, goal.clone(), risk, assessment));
     v1::PolicyResult {
         executable_goal: goal,
         action,
         leg_targets,
+        filter,
+    }
+}
+
+pub(crate) fn filter_result(
+    robot: &Robot,
+    executable_goal: Vec<f32>,
+    risk: Option<Risk>,
+    assessment: Assessment,
+) -> v1::FilterResult {
+    let links = robot.link_spheres();
+    let nearest = assessment.nearest_links;
+    let names = nearest.map(|nearest| nearest.links.map(|link| links[link].name.clone()));
+    let reasons = assessment.reasons.into_iter().map(change_reason);
+    v1::FilterResult {
+        executable_goal,
+        change: assessment.change,
+        regloss: risk.map(|risk| risk.regloss),
+        danger: risk.is_some_and(|risk| risk.danger),
+        applied: risk.map_or(0.0, |risk| risk.applied),
+        center_of_mass_margin: assessment.center_of_mass_margin,
+        smallest_link_distance: nearest.map_or(0.0, |nearest| nearest.distance),
+        nearest_links: names.into_iter().flatten().collect(),
+        reasons: reasons.map(i32::from).collect(),
+    }
+}
+
+fn change_reason(reason: Reason) -> v1::ChangeReason {
+    match reason {
+        Reason::Balance => v1::ChangeReason::Balance,
+        Reason::SelfCollision => v1::ChangeReason::SelfCollision,
+        Reason::JointLimit => v1::ChangeReason::JointLimit,
+        Reason::Speed => v1::ChangeReason::Speed,
     }
 }
 
@@ -93,6 +140,7 @@ pub(crate) fn robot(robot: &Robot) -> v1::Robot {
         leg_joints: robot.leg_joints().iter().map(joint).collect(),
         control_rate: robot.control_rate_hz(),
         key_nodes: key_nodes.collect(),
+        action_scale: robot.action_scale(),
     }
 }
 

@@ -47,6 +47,11 @@ impl EmpFilter {
         }
     }
 
+    /// What the filter remembers of a control period in which this share of its correction was executed.
+    pub fn memory(applied: f32) -> Vec<f32> {
+        vec![applied]
+    }
+
     /// The EMP.
     pub fn emp(&self) -> &Arc<Emp> {
         &self.emp
@@ -94,8 +99,7 @@ impl GoalFilter for EmpFilter {
             let danger = self.gate.is_passed(answer.regloss, frame, &layout);
             let before = item.memory.first().copied().unwrap_or(0.0);
             let applied = self.applied(before, danger);
-            item.memory.clear();
-            item.memory.push(applied);
+            *item.memory = Self::memory(applied);
             for (goal, executable) in item.goal.iter_mut().zip(&answer.goal) {
                 *goal += applied * (executable - *goal);
             }

@@ -278,7 +278,7 @@ fn read_controller(name: &str, policy: &PolicyModel) -> Result<Controller, Field
         "" => Controller::DECOUPLED,
         name => name,
     };
-    Controller::by_name(name, policy.model.policy(), None)
+    Controller::by_name(name, policy.model.policy(), policy.model.emp())
         .map_err(|error| FieldError::new("config.controller", error.to_string()))
 }
 

@@ -4,6 +4,7 @@
 //! A session is one task. It has at most one frame in the model's queue; the others wait here (`ALL`) or replace each
 //! other (`LATEST`).
 
+mod filter;
 mod policy;
 mod retarget;
 
@@ -14,7 +15,7 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 
-pub(crate) use self::{policy::PolicyStream, retarget::RetargetStream};
+pub(crate) use self::{filter::FilterStream, policy::PolicyStream, retarget::RetargetStream};
 use crate::{
     batcher::{Rejected, Ticket},
     catalog::{Catalog, Served},
@@ -56,7 +57,7 @@ pub(crate) trait Kind: Sized + Send + 'static {
     ) -> Result<&'a Arc<ServedBy<Self>>, ServiceError>;
 
     /// A stream before its first frame.
-    fn open(config: &Self::Config, model: &Arc<ServedBy<Self>>) -> Self;
+    fn open(config: &Self::Config, model: &Arc<ServedBy<Self>>) -> Result<Self, FieldError>;
 
     /// The message that says that the stream was accepted.
     fn started(&self) -> Self::Response;
@@ -214,11 +215,11 @@ impl<K: Kind> Session<K> {
     fn open(context: &SessionContext, config: &K::Config) -> Result<Self, ServiceError> {
         let delivery = read_delivery(K::delivery(config))?;
         let model = K::model(&context.catalog, config)?;
+        let kind = K::open(config, model)?;
         if let Some(retry) = model.batcher.overload(Priority::Stream) {
             return Err(Rejected::Full(retry).into());
         }
         tracing::info!(model = model.card.name, ?delivery, "stream started");
-        let kind = K::open(config, model);
         let started = kind.started();
         Ok(Self {
             kind,

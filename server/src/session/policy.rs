@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use emp_models::controller::{Controller, ControllerState};
+use emp_models::controller::ControllerState;
 use emp_proto::v1::{
     DroppedFrame, FrameHeader, PolicyFrame, SteppedFrame, StreamPolicyConfig, StreamPolicyRequest,
     StreamPolicyResponse, StreamPolicyStarted, stream_policy_request::Message as Request,
@@ -11,17 +11,18 @@ use emp_proto::v1::{
 
 use super::{Incoming, Kind};
 use crate::{
-    backend::{PolicyInput, PolicyOutput},
     catalog::{Catalog, PolicyModel},
+    control::{ControlInput, Controllers, EmpMode, PolicyOutput},
     error::{FieldError, ServiceError},
     queue::Answer,
-    robot_state::ControlPeriod,
+    robot_state::{self, ControlPeriod},
     wire,
 };
 
 /// What a stream of robot states remembers.
 pub(crate) struct PolicyStream {
     model: Arc<PolicyModel>,
+    mode: EmpMode,
     /// The past as far as it was answered.
     past: ControllerState,
     /// A frame that was to start an episode has arrived; the next good one does.
@@ -46,9 +47,9 @@ impl Kind for PolicyStream {
     type Config = StreamPolicyConfig;
     type WireFrame = PolicyFrame;
     type Frame = Frame;
-    type Input = PolicyInput;
+    type Input = ControlInput;
     type Output = PolicyOutput;
-    type Model = Controller;
+    type Model = Controllers;
 
     fn sort(request: StreamPolicyRequest) -> Option<Incoming<Self>> {
         Some(match request.message? {
@@ -72,12 +73,16 @@ impl Kind for PolicyStream {
         catalog.policy_for(&config.robot, &config.model, &config.model_version)
     }
 
-    fn open(_: &StreamPolicyConfig, model: &Arc<PolicyModel>) -> Self {
-        Self {
+    fn open(config: &StreamPolicyConfig, model: &Arc<PolicyModel>) -> Result<Self, FieldError> {
+        let has_emp = model.model.emp().is_some();
+        let mode =
+            robot_state::read_mode("config.emp_mode", config.emp_mode, EmpMode::Off, has_emp)?;
+        Ok(Self {
             model: Arc::clone(model),
+            mode,
             past: model.model.state(),
             must_reset: false,
-        }
+        })
     }
 
     fn started(&self) -> StreamPolicyResponse {
@@ -111,11 +116,11 @@ impl Kind for PolicyStream {
         new.reset |= old.reset;
     }
 
-    fn input(&mut self, frame: &Frame) -> PolicyInput {
+    fn input(&mut self, frame: &Frame) -> ControlInput {
         if frame.reset {
             self.past.reset();
         }
-        frame.period.clone().after(self.past.clone())
+        frame.period.clone().after(self.past.clone(), self.mode)
     }
 
     fn answer(
@@ -124,11 +129,16 @@ impl Kind for PolicyStream {
         answer: Answer<PolicyOutput>,
     ) -> StreamPolicyResponse {
         let timing = wire::timing(&answer);
-        let PolicyOutput { state, output } = answer.output;
+        let PolicyOutput {
+            state,
+            output,
+            assessment,
+        } = answer.output;
         self.past = state;
+        let result = wire::policy_result(&self.model.robot, self.mode, output, assessment);
         response(Response::Result(SteppedFrame {
             header,
-            result: Some(wire::policy_result(output)),
+            result: Some(result),
             timing: Some(timing),
         }))
     }

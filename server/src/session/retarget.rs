@@ -66,13 +66,13 @@ impl Kind for RetargetStream {
         catalog.retargeter_for(&config.robot, &config.model, &config.model_version)
     }
 
-    fn open(config: &StreamRetargetConfig, model: &Arc<RetargetModel>) -> Self {
-        Self {
+    fn open(config: &StreamRetargetConfig, model: &Arc<RetargetModel>) -> Result<Self, FieldError> {
+        Ok(Self {
             model: Arc::clone(model),
             refine: config.refine,
             smoother: config.smoothing.then(Smoother::new),
             previous: None,
-        }
+        })
     }
 
     fn started(&self) -> StreamRetargetResponse {

@@ -289,7 +289,7 @@ fn interval(metric: Option<&Metric>) -> String {
 type Of<T, V> = fn(&T) -> Option<&V>;
 
 /// Name, label and place of each metric.
-const METRICS: [(&str, &str, Of<EvaluationMetrics, Metric>); 8] = [
+const METRICS: [(&str, &str, Of<EvaluationMetrics, Metric>); 12] = [
     ("suc", "SUC  stood to the end", |set| set.suc.as_ref()),
     ("mjp", "MJP  joint tracking", |set| set.mjp.as_ref()),
     ("msc", "MSC  self-collision (N)", |set| set.msc.as_ref()),
@@ -303,6 +303,18 @@ const METRICS: [(&str, &str, Of<EvaluationMetrics, Metric>); 8] = [
     ("mbo", "MBO  base orientation", |set| set.mbo.as_ref()),
     ("mus", "MUS  unsmoothness ((rad/s)²)", |set| {
         set.mus.as_ref()
+    }),
+    ("change", "goals changed by (rad)", |set| {
+        set.change.as_ref()
+    }),
+    ("relative_change", "     as a share of their reach", |set| {
+        set.relative_change.as_ref()
+    }),
+    ("amplitude_loss", "     amplitude lost", |set| {
+        set.amplitude_loss.as_ref()
+    }),
+    ("changed_share", "     frames with a changed goal", |set| {
+        set.changed_share.as_ref()
     }),
 ];
 
@@ -373,6 +385,10 @@ fn partial(episodes: &[EpisodeResult]) -> Option<EvaluationMetrics> {
         mba: over_frames(|metrics| metrics.mba),
         mbo: over_frames(|metrics| metrics.mbo),
         mus: over_frames(|metrics| metrics.mus),
+        change: over_frames(|metrics| metrics.change),
+        relative_change: over_frames(|metrics| metrics.relative_change),
+        amplitude_loss: over_frames(|metrics| metrics.amplitude_loss),
+        changed_share: over_frames(|metrics| metrics.changed_share),
         goals: None,
     })
 }
@@ -415,6 +431,10 @@ fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
         "mba",
         "mbo",
         "mus",
+        "change",
+        "relative_change",
+        "amplitude_loss",
+        "changed_share",
     ])?;
     for episode in episodes {
         let metrics = episode.metrics.unwrap_or_default();
@@ -435,6 +455,10 @@ fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
             metrics.mba,
             metrics.mbo,
             metrics.mus,
+            metrics.change,
+            metrics.relative_change,
+            metrics.amplitude_loss,
+            metrics.changed_share,
         ];
         row.extend(values.map(|value| format!("{value:.6}")));
         csv.write_record(row)?;

@@ -174,7 +174,8 @@ pub(crate) fn summary(
 /// The paper's metrics, as the evaluation computes them.
 fn metrics(robot: &Robot, run: &Run) -> Metrics<f64> {
     let mut sums = EpisodeSums::default();
-    let goals = robot.goal_joints().len();
+    let joints = robot.goal_joints().iter();
+    let default: Vec<f32> = joints.map(|joint| joint.default as f32).collect();
     let readings = run.periods.iter().map(|period| &period.reading);
     let before = std::iter::once(&run.start).chain(readings);
     for (period, before) in run.periods.iter().zip(before) {
@@ -182,7 +183,9 @@ fn metrics(robot: &Robot, run: &Run) -> Metrics<f64> {
             sums.add(&Frame {
                 reading: &period.reading,
                 goal: &period.goal,
-                speeds_before: &before.joint_velocities[..goals],
+                executed: &period.goal,
+                default: &default,
+                speeds_before: &before.joint_velocities[..default.len()],
             });
         }
     }

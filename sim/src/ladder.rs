@@ -227,7 +227,6 @@ impl fmt::Display for Ladder {
 mod tests {
     use std::sync::Arc;
 
-
     use super::*;
     use crate::Priority;
     use crate::evaluation::EpisodeResult;

@@ -1,5 +1,5 @@
-//! The paper's metrics (section VI), over the executed frames of each episode: those up to and including the fall, or the
-//! clip's end.
+//! The paper's metrics (section VI), and what a filter takes for them, over the executed frames of each episode: those up to
+//! and including the fall, or the clip's end.
 
 use emp_models::observation::roll_pitch_yaw;
 use rand::{RngExt as _, SeedableRng as _};
@@ -14,7 +14,7 @@ const RESAMPLES: usize = 2000;
 const QUANTILES: [f64; 2] = [0.025, 0.975];
 
 /// Number of metrics.
-pub const METRICS: usize = 8;
+pub const METRICS: usize = 12;
 
 /// One value for each metric.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -35,6 +35,15 @@ pub struct Metrics<T> {
     pub mbo: T,
     /// `‖q̇_t − q̇_{t−1}‖₂²` over the goal joints, (rad/s)²; less is better.
     pub mus: T,
+    /// Mean of |ĝ − g| over the goal joints, ĝ the goal that was executed, rad; less is better.
+    pub change: T,
+    /// `‖ĝ − g‖₂ / ‖g − g₀‖₂` over all frames at once (relL2), g₀ the default pose; less is better.
+    pub relative_change: T,
+    /// (g − ĝ)·(g − g₀) / ‖g − g₀‖₂² over all frames at once: the share of the motion's amplitude that is lost; less is
+    /// better.
+    pub amplitude_loss: T,
+    /// Share of frames in which ĝ was not g.
+    pub changed_share: T,
 }
 
 impl<T> Metrics<T> {
@@ -48,6 +57,10 @@ impl<T> Metrics<T> {
         "mba",
         "mbo",
         "mus",
+        "change",
+        "relative_change",
+        "amplitude_loss",
+        "changed_share",
     ];
 
     /// The values in the order of the fields.
@@ -61,13 +74,30 @@ impl<T> Metrics<T> {
             self.mba,
             self.mbo,
             self.mus,
+            self.change,
+            self.relative_change,
+            self.amplitude_loss,
+            self.changed_share,
         ]
     }
 }
 
 impl<T> From<[T; METRICS]> for Metrics<T> {
     fn from(values: [T; METRICS]) -> Self {
-        let [suc, mjp, msc, self_collision_share, mbv, mba, mbo, mus] = values;
+        let [
+            suc,
+            mjp,
+            msc,
+            self_collision_share,
+            mbv,
+            mba,
+            mbo,
+            mus,
+            change,
+            relative_change,
+            amplitude_loss,
+            changed_share,
+        ] = values;
         Self {
             suc,
             mjp,
@@ -77,6 +107,10 @@ impl<T> From<[T; METRICS]> for Metrics<T> {
             mba,
             mbo,
             mus,
+            change,
+            relative_change,
+            amplitude_loss,
+            changed_share,
         }
     }
 }
@@ -86,8 +120,11 @@ impl<T> From<[T; METRICS]> for Metrics<T> {
 pub struct EpisodeSums {
     /// Frames that were measured.
     pub frames: usize,
-    /// `suc` is 1 if the robot stood to the end, else 0; the others are sums over the frames.
+    /// `suc` is 1 if the robot stood to the end, else 0; the others are sums over the frames: of ‖ĝ − g‖² for
+    /// `relative_change`, of (g − ĝ)·(g − g₀) for `amplitude_loss`.
     pub sums: Metrics<f64>,
+    /// Sum of ‖g − g₀‖², rad².
+    pub amplitude: f64,
 }
 
 /// One executed frame.
@@ -95,8 +132,12 @@ pub struct EpisodeSums {
 pub struct Frame<'a> {
     /// What was measured at its end.
     pub reading: &'a Reading,
-    /// The goal that was asked for, before any filter, rad.
+    /// The goal g that was asked for, before any filter, rad.
     pub goal: &'a [f32],
+    /// The goal ĝ that was executed, rad.
+    pub executed: &'a [f32],
+    /// The default pose g₀ of the goal joints, rad.
+    pub default: &'a [f32],
     /// Speeds of the goal joints at the end of the frame before, rad/s.
     pub speeds_before: &'a [f32],
 }
@@ -107,6 +148,8 @@ impl EpisodeSums {
         let Frame {
             reading,
             goal,
+            executed,
+            default,
             speeds_before,
         } = frame;
         let sums = &mut self.sums;
@@ -119,6 +162,18 @@ impl EpisodeSums {
         let [roll, pitch, _] = roll_pitch_yaw(&reading.orientation);
         sums.mbo += (-10.0 * (roll.abs() + pitch.abs())).exp();
         sums.mus += square_distance(&reading.joint_velocities, speeds_before);
+
+        let differences = executed.iter().zip(*goal).map(|(a, b)| f64::from(a - b));
+        let sizes = differences.clone().map(f64::abs);
+        sums.change += sizes.sum::<f64>() / goal.len().max(1) as f64;
+        sums.relative_change += square_distance(executed, goal);
+        let offsets = goal.iter().zip(*default).map(|(a, b)| f64::from(a - b));
+        let along = differences
+            .zip(offsets)
+            .map(|(change, offset)| -change * offset);
+        sums.amplitude_loss += along.sum::<f64>();
+        sums.changed_share += f64::from(u8::from(executed != goal));
+        self.amplitude += square_distance(goal, default);
     }
 
     /// The episode's own metrics: means over its frames.
@@ -135,20 +190,29 @@ fn square_distance(a: &[f32], b: &[f32]) -> f64 {
 
 /// SUC over the episodes, the other metrics over all their frames; 0 of none.
 fn means<'a>(episodes: impl IntoIterator<Item = &'a EpisodeSums>) -> Metrics<f64> {
-    let (mut count, mut frames) = (0, 0);
+    let (mut count, mut frames, mut amplitude) = (0, 0, 0.0);
     let mut sums = [0.0; METRICS];
     for episode in episodes {
         count += 1;
         frames += episode.frames;
+        amplitude += episode.amplitude;
         for (sum, value) in sums.iter_mut().zip(episode.sums.array()) {
             *sum += value;
         }
     }
-    for sum in &mut sums[1..] {
-        *sum /= frames.max(1) as f64;
-    }
-    sums[0] /= f64::from(count.max(1));
-    sums.into()
+    let sums = Metrics::from(sums);
+    let of_amplitude = |sum: f64| {
+        if amplitude > 0.0 {
+            sum / amplitude
+        } else {
+            0.0
+        }
+    };
+    let mut means = Metrics::from(sums.array().map(|sum| sum / frames.max(1) as f64));
+    means.suc = sums.suc / f64::from(count.max(1));
+    means.relative_change = of_amplitude(sums.relative_change).sqrt();
+    means.amplitude_loss = of_amplitude(sums.amplitude_loss);
+    means
 }
 
 /// A mean and its 95 % bootstrap interval.
@@ -167,9 +231,8 @@ pub struct Interval {
 /// The same episodes and seed give the same numbers. Where every episode succeeds (or fails), so does every resample: the
 /// interval of `suc` is then a point.
 pub fn summary(episodes: &[EpisodeSums], seed: u64) -> Metrics<Interval> {
-    intervals(episodes.len(), seed, |sample| {
-        means(sample.iter().map(|&i| &episodes[i])).array()
-    })
+    let statistic = |sample: &[usize]| means(sample.iter().map(|&i| &episodes[i])).array();
+    intervals(episodes.len(), seed, statistic).into()
 }
 
 /// The difference `ours − theirs` of the metrics on the same episodes, pair by pair: intervals from resampling the pairs.
@@ -182,22 +245,50 @@ pub fn paired_difference(
     seed: u64,
 ) -> Metrics<Interval> {
     assert_eq!(ours.len(), theirs.len(), "episodes come in pairs");
-    intervals(ours.len(), seed, |sample| {
+    let difference = |sample: &[usize]| {
         let ours = means(sample.iter().map(|&i| &ours[i])).array();
         let theirs = means(sample.iter().map(|&i| &theirs[i])).array();
         std::array::from_fn(|metric| ours[metric] - theirs[metric])
-    })
+    };
+    intervals(ours.len(), seed, difference).into()
 }
 
-fn intervals(
+/// The share of `theirs` failures that `ours` does without, on the same episodes: 1 − ours/theirs, with its interval from
+/// resampling the pairs; below 0 if there are more. None where they fail in no episode.
+///
+/// # Panics
+/// If there are not as many of the one as of the other.
+pub fn failures_cut(ours: &[EpisodeSums], theirs: &[EpisodeSums], seed: u64) -> Option<Interval> {
+    assert_eq!(ours.len(), theirs.len(), "episodes come in pairs");
+    let failures = |episodes: &[EpisodeSums], sample: &[usize]| {
+        let stood: f64 = sample.iter().map(|&i| episodes[i].sums.suc).sum();
+        sample.len() as f64 - stood
+    };
+    let cut = |sample: &[usize]| {
+        let theirs = failures(theirs, sample);
+        // A resample without failures has none to cut.
+        let left = if theirs > 0.0 {
+            failures(ours, sample) / theirs
+        } else {
+            1.0
+        };
+        [1.0 - left]
+    };
+    let all: Vec<usize> = (0..theirs.len()).collect();
+    let [interval] = intervals(ours.len(), seed, cut);
+    (failures(theirs, &all) > 0.0).then_some(interval)
+}
+
+/// Statistics of `count` episodes, with intervals from resampling the episodes.
+fn intervals<const N: usize>(
     count: usize,
     seed: u64,
-    statistic: impl Fn(&[usize]) -> [f64; METRICS],
-) -> Metrics<Interval> {
+    statistic: impl Fn(&[usize]) -> [f64; N],
+) -> [Interval; N] {
     let mut sample: Vec<usize> = (0..count).collect();
     let whole = statistic(&sample);
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut resampled: [Vec<f64>; METRICS] = std::array::from_fn(|_| Vec::new());
+    let mut resampled: [Vec<f64>; N] = std::array::from_fn(|_| Vec::new());
     for _ in 0..RESAMPLES {
         for index in &mut sample {
             *index = rng.random_range(0..count);
@@ -206,17 +297,16 @@ fn intervals(
             values.push(value);
         }
     }
-    let intervals: [Interval; METRICS] = std::array::from_fn(|metric| {
-        let values = &mut resampled[metric];
+    std::array::from_fn(|index| {
+        let values = &mut resampled[index];
         values.sort_by(f64::total_cmp);
         let [low, high] = QUANTILES.map(|share| quantile(values, share));
         Interval {
-            mean: whole[metric],
+            mean: whole[index],
             low,
             high,
         }
-    });
-    intervals.into()
+    })
 }
 
 /// The value below which a share of sorted values lies, interpolated between neighbours.
@@ -268,6 +358,8 @@ mod tests {
         sums.add(&Frame {
             reading: &reading(),
             goal: &[0.0, 0.0],
+            executed: &[0.1, -0.3],
+            default: &[-0.5, 1.0],
             speeds_before: &[0.5, 1.0],
         });
         let expected = [
@@ -279,6 +371,10 @@ mod tests {
             0.223_130_160_1, // exp(−3 · 0.5)
             0.606_530_659_7, // exp(−10 · 0.05)
             1.25,            // 0.5² + 1²
+            0.2,             // (0.1 + 0.3) / 2
+            0.282_842_712_5, // √(0.1² + 0.3²) / √(0.5² + 1²)
+            -0.28,           // (−0.1 · 0.5 + 0.3 · −1) / 1.25
+            1.0,
         ];
         close(sums.means(), expected);
     }
@@ -290,6 +386,8 @@ mod tests {
             Frame {
                 reading,
                 goal: &[0.0, 0.0],
+                executed: &[0.0, 0.0],
+                default: &[0.0, 0.0],
                 speeds_before: &[0.0, 0.0],
             }
         }
@@ -308,6 +406,10 @@ mod tests {
             (0.223_130_160_1 + 3.0) / 4.0,
             (0.606_530_659_7 + 3.0) / 4.0,
             5.0 / 4.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
         ];
         close(means([&fell, &stood]), expected);
         let summary = summary(&[fell, stood], 1);
@@ -328,8 +430,48 @@ mod tests {
                 mjp: 80.0 + (i % 5) as f64,
                 ..Metrics::default()
             },
+            amplitude: 1.0,
         };
         (0..count).map(episode).collect()
+    }
+
+    #[test]
+    fn a_cut_loses_its_share_of_the_amplitude_and_nothing_across() {
+        let mut sums = EpisodeSums::default();
+        let default = [0.1, -0.2];
+        for t in 0..20 {
+            let goal = [0.1 + 0.05 * t as f32, -0.2 - 0.02 * t as f32];
+            let executed = [0, 1].map(|j| default[j] + 0.9 * (goal[j] - default[j]));
+            sums.add(&Frame {
+                reading: &still(),
+                goal: &goal,
+                executed: &executed,
+                default: &default,
+                speeds_before: &[0.0, 0.0],
+            });
+        }
+        let means = sums.means();
+        assert!((means.relative_change - 0.1).abs() < 1e-6, "{means:?}");
+        assert!((means.amplitude_loss - 0.1).abs() < 1e-6, "{means:?}");
+        // The mean of 0.1 · 0.035 · t over t.
+        assert!((means.change - 0.1 * 0.035 * 9.5).abs() < 1e-6, "{means:?}");
+        // The first goal is the default pose, which a cut leaves.
+        assert!((means.changed_share - 0.95).abs() < 1e-12);
+    }
+
+    #[test]
+    fn failures_are_cut_by_the_share_that_is_gone() {
+        let (few, many) = (coins(400, 390), coins(400, 360));
+        let cut = failures_cut(&few, &many, 5).unwrap();
+        assert!((cut.mean - 0.75).abs() < 1e-12, "{cut:?}");
+        assert!(cut.low > 0.55 && cut.low < 0.7 && cut.high < 0.9, "{cut:?}");
+        let more = failures_cut(&many, &few, 5).unwrap();
+        assert!(
+            (more.mean + 3.0).abs() < 1e-12 && more.high < 0.0,
+            "{more:?}"
+        );
+        assert_eq!(failures_cut(&many, &coins(400, 400), 5), None);
+        assert_eq!(failures_cut(&[], &[], 5), None);
     }
 
     #[test]

@@ -51,6 +51,10 @@ pub(super) fn episode(result: &EpisodeResult, robot: &Robot) -> v1::EpisodeResul
             mba: means.mba,
             mbo: means.mbo,
             mus: means.mus,
+            change: means.change,
+            relative_change: means.relative_change,
+            amplitude_loss: means.amplitude_loss,
+            changed_share: means.changed_share,
         }),
     }
 }
@@ -68,6 +72,10 @@ fn metrics(scores: &Scores) -> v1::EvaluationMetrics {
         mba: metric(metrics.mba),
         mbo: metric(metrics.mbo),
         mus: metric(metrics.mus),
+        change: metric(metrics.change),
+        relative_change: metric(metrics.relative_change),
+        amplitude_loss: metric(metrics.amplitude_loss),
+        changed_share: metric(metrics.changed_share),
         goals: scores.goals.as_ref().map(goal_statistics),
     }
 }

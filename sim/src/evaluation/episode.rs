@@ -24,6 +24,8 @@ pub(super) struct Setting {
     pub(super) pushes: Option<Pushes>,
     /// When a robot has fallen: as in training.
     pub(super) limits: EnvironmentConfig,
+    /// The default pose of the goal joints, rad.
+    pub(super) default: Vec<f32>,
     /// Bodies of the model.
     pub(super) bodies: usize,
 }
@@ -158,6 +160,8 @@ impl<'a> Episode<'a> {
             self.sums.add(&Frame {
                 reading,
                 goal: asked,
+                executed: &output.goal,
+                default: &setting.default,
                 speeds_before: &speeds_before,
             });
         }

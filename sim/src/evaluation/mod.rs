@@ -110,6 +110,19 @@ impl Evaluation {
     /// The difference `self − other` of the metrics over the episodes that both finished, with intervals over pairs; none
     /// where the two are not of the same robot, seed and clips, or have no episode in common.
     pub fn difference(&self, other: &Self) -> Option<Metrics<Interval>> {
+        let [ours, theirs] = self.pairs(other)?;
+        Some(metrics::paired_difference(&ours, &theirs, self.seed))
+    }
+
+    /// The share of `other`'s failures that `self` does without, over the same episodes; none where there are no pairs or no
+    /// failures of `other`.
+    pub fn failures_cut(&self, other: &Self) -> Option<Interval> {
+        let [ours, theirs] = self.pairs(other)?;
+        metrics::failures_cut(&ours, &theirs, self.seed)
+    }
+
+    /// Episodes that both finished, ours and theirs in the same order.
+    fn pairs(&self, other: &Self) -> Option<[Vec<EpisodeSums>; 2]> {
         if (&self.robot, self.seed) != (&other.robot, other.seed) {
             return None;
         }
@@ -129,8 +142,7 @@ impl Evaluation {
             pairs[0].push(ours.sums);
             pairs[1].push(theirs.sums);
         }
-        let [ours, theirs] = pairs;
-        (!ours.is_empty()).then(|| metrics::paired_difference(&ours, &theirs, self.seed))
+        (!pairs[0].is_empty()).then_some(pairs)
     }
 }
 
@@ -182,6 +194,11 @@ pub fn evaluate_observed(
             pushes: settings.pushes(&randomization),
             randomization,
             limits: EnvironmentConfig::default(),
+            default: robot
+                .goal_joints()
+                .iter()
+                .map(|joint| joint.default as f32)
+                .collect(),
             bodies: robot.model().body_mass().len(),
         },
     };

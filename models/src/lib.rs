@@ -19,6 +19,7 @@ pub mod observation;
 pub mod optimizer;
 pub mod policy;
 pub mod retarget;
+pub mod world_model;
 
 pub use checkpoint::CheckpointMetadata;
 pub use error::ModelError;

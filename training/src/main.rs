@@ -60,6 +60,10 @@ enum Command {
     /// Procedural skills are always in the mix; recorded motion comes from --motions. The run's checkpoint and CSV logs stand in
     /// runs/emp-ROBOT; Ctrl-C saves, --resume continues bit for bit.
     Emp(train_emp::Arguments),
+    /// Train the rows of the paper's ablation table, one after the other, and write the table.
+    ///
+    /// Runs, checkpoints and the table stand in runs/ablation-ROBOT; Ctrl-C saves, --resume continues.
+    EmpAblation(train_emp::AblationArguments),
     /// Draw the learning curves of policies.
     PolicyCurves(CurvesArguments),
     /// Score a trained policy, bare and behind goal filters: held-out clips, larger amplitude, full randomisation.
@@ -220,6 +224,7 @@ fn main() -> Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
         Command::Emp(arguments) => train_emp::run(&arguments),
+        Command::EmpAblation(arguments) => train_emp::run_ablation(&arguments),
         Command::PolicyReport(arguments) => policy_report::run(&arguments),
         Command::FallReport(arguments) => fall_report::run(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),

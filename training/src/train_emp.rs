@@ -1,6 +1,11 @@
-//! `emp-train emp`.
+//! `emp-train emp` and `emp-train emp-ablation`.
 
-use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
+use std::{
+    path::{Path, PathBuf},
+    process::ExitCode,
+    sync::Arc,
+    time::Duration,
+};
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
@@ -8,6 +13,7 @@ use emp_models::{policy::Policy, retarget::Retargeter};
 use emp_sim::{Pool, Priority};
 use emp_training::{
     emp::{
+        ablation,
         data::{self, Motions},
         judge::Judge,
         settings::{Preset, Settings},
@@ -18,9 +24,9 @@ use emp_training::{
 
 use crate::{RobotArguments, policy_weights, retargeter_weights};
 
-/// What is trained, and on what.
+/// What every training of an EMP takes.
 #[derive(Args)]
-pub(crate) struct Arguments {
+pub(crate) struct TrainingArguments {
     #[command(flatten)]
     robot: RobotArguments,
     /// Folders (or files) of recorded motion: .bvh, AMASS .npz, key-node .npz.
@@ -29,17 +35,14 @@ pub(crate) struct Arguments {
     /// Settings to start from.
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,
-    /// Change one setting, as in `risk.weight=50` or `losses.smooth_on=target`; --print-settings shows all.
+    /// Change one setting, as in `risk.weight=50` or `losses.smooth_on=target`; `emp-train emp --print-settings` shows all.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     changes: Vec<String>,
-    /// Print the settings as JSON and stop.
-    #[arg(long)]
-    print_settings: bool,
     /// Seed of weights, episodes and procedural skills.
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Environment steps to learn from; a resumed run may be given more.
-    #[arg(long, default_value_t = 6_000_000)]
+    #[arg(long, default_value_t = 8_000_000)]
     steps: u64,
     /// The frozen policy [default: models/weights/ROBOT-policy.safetensors].
     #[arg(long, value_name = "FILE")]
@@ -47,15 +50,9 @@ pub(crate) struct Arguments {
     /// Weights of the retargeter [default: models/weights/ROBOT-retargeter.safetensors].
     #[arg(long, value_name = "FILE")]
     retargeter: Option<PathBuf>,
-    /// Where the weights go, f16 safetensors; written at every evaluation [default: best.safetensors in the run's folder].
-    #[arg(long, value_name = "FILE")]
-    out: Option<PathBuf>,
-    /// Continue the run from its checkpoint.
+    /// Continue from the checkpoint, or from those that there are.
     #[arg(long)]
     resume: bool,
-    /// Folder of the run's checkpoint and logs [default: runs/emp-ROBOT].
-    #[arg(long, value_name = "DIR")]
-    run: Option<PathBuf>,
     /// Seconds between two checkpoints.
     #[arg(long, default_value_t = 120)]
     save_every: u64,
@@ -64,84 +61,180 @@ pub(crate) struct Arguments {
     threads: usize,
 }
 
+/// What is trained.
+#[derive(Args)]
+pub(crate) struct Arguments {
+    #[command(flatten)]
+    training: TrainingArguments,
+    /// Print the settings as JSON and stop.
+    #[arg(long)]
+    print_settings: bool,
+    /// Where the weights go, f16 safetensors; written at every evaluation [default: best.safetensors in the run's folder].
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Folder of the run's checkpoint and logs [default: runs/emp-ROBOT].
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+}
+
+/// Which parts are left out, and where it goes.
+#[derive(Args)]
+pub(crate) struct AblationArguments {
+    #[command(flatten)]
+    training: TrainingArguments,
+    /// Folder of the four runs and of the table, ablation.md and ablation.json [default: runs/ablation-ROBOT].
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
 /// Trains an EMP.
 pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
-    let settings = settings(arguments)?;
+    let settings = settings(&arguments.training)?;
     if arguments.print_settings {
         println!("{}", serde_json::to_string_pretty(&settings)?);
         return Ok(ExitCode::SUCCESS);
     }
-    let robot = arguments.robot.load()?;
-    let folder = arguments
-        .run
-        .clone()
-        .unwrap_or_else(|| PathBuf::from(format!("runs/emp-{}", robot.name())));
+    let robot = &arguments.training.robot.robot;
+    let default = || PathBuf::from(format!("runs/emp-{robot}"));
+    let mut files = files(
+        &arguments.training,
+        arguments.run.clone().unwrap_or_else(default),
+    );
+    if let Some(out) = &arguments.out {
+        files.weights.clone_from(out);
+    }
+    refuse_overwriting(&arguments.training, &files)?;
+    let workshop = Workshop::new(&arguments.training, &settings)?;
+    let interrupt = Interrupt::listen()?;
+    match workshop.train(&arguments.training, settings, &files, &interrupt)? {
+        Outcome::Finished => {
+            eprintln!("wrote {}", files.weights.display());
+            Ok(ExitCode::SUCCESS)
+        }
+        Outcome::Interrupted => Ok(interrupted()),
+    }
+}
+
+/// Trains the rows of the paper's ablation table one after the other, and writes the table.
+pub(crate) fn run_ablation(arguments: &AblationArguments) -> Result<ExitCode> {
+    let full = settings(&arguments.training)?;
+    let workshop = Workshop::new(&arguments.training, &full)?;
+    let robot = &arguments.training.robot.robot;
+    let default = || PathBuf::from(format!("runs/ablation-{robot}"));
+    let folder = arguments.out.clone().unwrap_or_else(default);
+    let interrupt = Interrupt::listen()?;
+    let mut weights = Vec::new();
+    for row in ablation::Row::ALL {
+        let files = files(&arguments.training, folder.join(row.name()));
+        refuse_overwriting(&arguments.training, &files)?;
+        eprintln!("{row}");
+        match workshop.train(&arguments.training, row.settings(&full), &files, &interrupt)? {
+            Outcome::Finished => weights.push((row, files.weights)),
+            Outcome::Interrupted => return Ok(interrupted()),
+        }
+    }
+    let table = ablation::table(&workshop.judge, &workshop.equipment.robot, &weights)?;
+    table.write(&folder)?;
+    print!("{table}");
+    Ok(ExitCode::SUCCESS)
+}
+
+fn interrupted() -> ExitCode {
+    eprintln!("interrupted; continue with --resume");
+    ExitCode::from(3)
+}
+
+/// What several trainings of one robot share.
+struct Workshop {
+    equipment: Equipment,
+    judge: Judge,
+    data: serde_json::Value,
+}
+
+impl Workshop {
+    fn new(arguments: &TrainingArguments, settings: &Settings) -> Result<Self> {
+        let robot = arguments.robot.load()?;
+        let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
+        let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
+        let weights = policy_weights(arguments.policy.as_ref(), &robot);
+        let policy = Arc::new(Policy::load(&weights, Arc::clone(&robot))?);
+        let pool = Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?);
+        let motions = Motions {
+            folders: &arguments.motions,
+            procedural: settings.procedural_clips,
+            seed: settings.seed,
+            live: settings.live,
+        };
+        let (clips, data) = data::clips(&retargeter, &motions, arguments.threads)?;
+        eprintln!("{} clips", clips.len());
+        let threads = rayon::ThreadPoolBuilder::new().num_threads(arguments.threads);
+        let threads = threads.build().context("starting the learner's threads")?;
+        Ok(Self {
+            judge: Judge::new(
+                &retargeter,
+                Arc::clone(&policy),
+                settings.evaluation_clips,
+                Arc::clone(&pool),
+                arguments.threads,
+            )?,
+            equipment: Equipment {
+                robot,
+                policy,
+                pool,
+                clips: clips.into(),
+                threads: Arc::new(threads),
+            },
+            data,
+        })
+    }
+
+    /// Trains to the arguments' steps; from the checkpoint, if there is one.
+    fn train(
+        &self,
+        arguments: &TrainingArguments,
+        settings: Settings,
+        files: &RunFiles,
+        interrupt: &Interrupt,
+    ) -> Result<Outcome> {
+        let equipment = self.equipment.clone();
+        let checkpoint = files.checkpoint();
+        let mut trainer = if checkpoint.exists() {
+            Trainer::resume(equipment, settings, &checkpoint)?
+        } else {
+            Trainer::new(equipment, settings)?
+        };
+        let run = Run {
+            files,
+            judge: &self.judge,
+            data: self.data.clone(),
+        };
+        trainer::train(&mut trainer, arguments.steps, &run, interrupt)
+    }
+}
+
+fn files(arguments: &TrainingArguments, folder: PathBuf) -> RunFiles {
     let mut files = RunFiles {
         folder,
         weights: PathBuf::new(),
         save_every: Duration::from_secs(arguments.save_every),
     };
-    files.weights = arguments.out.clone().unwrap_or_else(|| files.best());
-    let checkpoint = files.checkpoint();
+    files.weights = files.best();
+    files
+}
+
+/// A checkpoint may be there only to be resumed.
+fn refuse_overwriting(arguments: &TrainingArguments, files: &RunFiles) -> Result<()> {
+    let checkpoint: &Path = &files.checkpoint();
     ensure!(
         arguments.resume || !checkpoint.exists(),
-        "{} exists: continue with --resume, or remove it, or name another --run",
+        "{} exists: continue with --resume, or remove it, or name another folder",
         checkpoint.display()
     );
-    let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
-    let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
-    let weights = policy_weights(arguments.policy.as_ref(), &robot);
-    let policy = Arc::new(Policy::load(&weights, Arc::clone(&robot))?);
-    let pool = Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?);
-    let judge = Judge::new(
-        &retargeter,
-        Arc::clone(&policy),
-        settings.evaluation_clips,
-        Arc::clone(&pool),
-        arguments.threads,
-    )?;
-    let motions = Motions {
-        folders: &arguments.motions,
-        procedural: settings.procedural_clips,
-        seed: settings.seed,
-        live: settings.live,
-    };
-    let (clips, data) = data::clips(&retargeter, &motions, arguments.threads)?;
-    eprintln!("{} clips", clips.len());
-    let threads = rayon::ThreadPoolBuilder::new().num_threads(arguments.threads);
-    let equipment = Equipment {
-        robot,
-        policy,
-        pool,
-        clips: clips.into(),
-        threads: threads.build().context("starting the learner's threads")?,
-    };
-    let mut trainer = if arguments.resume {
-        Trainer::resume(equipment, settings, &checkpoint)?
-    } else {
-        Trainer::new(equipment, settings)?
-    };
-    let run = Run {
-        files: &files,
-        judge: &judge,
-        data,
-    };
-    let interrupt = Interrupt::listen()?;
-    match trainer::train(&mut trainer, arguments.steps, &run, &interrupt)? {
-        Outcome::Finished => {
-            eprintln!("wrote {}", files.weights.display());
-            Ok(ExitCode::SUCCESS)
-        }
-        Outcome::Interrupted => {
-            let steps = trainer.steps();
-            eprintln!("interrupted after {steps} environment steps; continue with --resume");
-            Ok(ExitCode::from(3))
-        }
-    }
+    Ok(())
 }
 
 /// The preset's settings with the arguments' changes.
-fn settings(arguments: &Arguments) -> Result<Settings> {
+fn settings(arguments: &TrainingArguments) -> Result<Settings> {
     let mut settings = Settings::preset(arguments.preset);
     settings.seed = arguments.seed;
     for change in &arguments.changes {

@@ -12,7 +12,7 @@ use emp_models::{
 use emp_motion::skills;
 use emp_sim::{
     Pool,
-    evaluation::{Evaluation, ExecutedFrame, Observer, evaluate_observed},
+    evaluation::{Evaluation, evaluate},
     goals::{GoalClip, Source},
     suite::Condition,
 };
@@ -123,65 +123,56 @@ impl Judge {
             decoupled: Vec::new(),
             policy,
         };
-        let decoupled = Controller::new(Arc::clone(&judge.policy), None);
-        for trial in TRIALS {
-            let (evaluation, _) = judge.evaluate(&decoupled, trial)?;
-            judge.decoupled.push(evaluation);
-        }
+        judge.decoupled = judge.evaluations(None)?;
         Ok(judge)
     }
 
-    /// Judges an EMP. The same EMP always gets the same verdict.
+    /// The evaluations of the policy behind an EMP, or of the policy alone: one for each condition. The same EMP always gets
+    /// the same.
+    ///
+    /// # Errors
+    /// When the EMP fails.
+    pub fn evaluations(&self, emp: Option<Emp>) -> Result<Vec<Evaluation>> {
+        let filter = emp.map(|emp| Arc::new(EmpFilter::always(Arc::new(emp))) as _);
+        let controller = Controller::new(Arc::clone(&self.policy), filter);
+        let evaluations = TRIALS.into_iter().map(|trial| {
+            let settings = trial.settings(self.policy.robot(), SEED);
+            Ok(evaluate(
+                &self.pool,
+                &controller,
+                &self.clips,
+                &settings,
+                &mut (),
+            )?)
+        });
+        evaluations.collect()
+    }
+
+    /// The conditions of [`evaluations`](Self::evaluations), in their order.
+    pub fn trials(&self) -> [Condition; TRIALS.len()] {
+        TRIALS
+    }
+
+    /// Judges an EMP.
     ///
     /// # Errors
     /// When the EMP fails.
     pub fn judge(&self, emp: Emp) -> Result<Verdict> {
-        let filter = Arc::new(EmpFilter::always(Arc::new(emp)));
-        let controller = Controller::new(Arc::clone(&self.policy), Some(filter));
-        let trials = TRIALS.into_iter().zip(&self.decoupled);
-        let trials = trials.map(|(trial, decoupled)| {
-            let (evaluation, change) = self.evaluate(&controller, trial)?;
-            let (with, without) = (&evaluation.all.metrics, &decoupled.all.metrics);
-            Ok(Figures {
+        let evaluations = self.evaluations(Some(emp))?;
+        let trials = TRIALS.into_iter().zip(evaluations).zip(&self.decoupled);
+        let figures = trials.map(|((trial, with), without)| {
+            let (with, without) = (&with.all.metrics, &without.all.metrics);
+            Figures {
                 trial,
                 falls: 1.0 - with.suc.mean,
                 falls_decoupled: 1.0 - without.suc.mean,
-                change,
+                change: with.change.mean,
                 msc_ratio: with.msc.mean / without.msc.mean.max(1e-9),
                 mjp_difference: with.mjp.mean - without.mjp.mean,
-            })
+            }
         });
         Ok(Verdict {
-            trials: trials.collect::<Result<_>>()?,
+            trials: figures.collect(),
         })
-    }
-
-    /// An evaluation, and the mean absolute change of a goal angle, rad.
-    fn evaluate(&self, controller: &Controller, trial: Condition) -> Result<(Evaluation, f64)> {
-        let settings = trial.settings(self.policy.robot(), SEED);
-        let mut change = Change::default();
-        let evaluation = evaluate_observed(
-            &self.pool,
-            controller,
-            &self.clips,
-            &settings,
-            &mut (),
-            &mut change,
-        )?;
-        Ok((evaluation, change.sum / change.angles.max(1.0)))
-    }
-}
-
-#[derive(Default)]
-struct Change {
-    sum: f64,
-    angles: f64,
-}
-
-impl Observer for Change {
-    fn executed(&mut self, frame: &ExecutedFrame<'_>) {
-        let pairs = frame.output.goal.iter().zip(frame.asked);
-        self.sum += pairs.map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
-        self.angles += frame.asked.len() as f64;
     }
 }

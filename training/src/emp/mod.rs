@@ -1,5 +1,6 @@
 //! The Executable Motion Prior: learning to change goals only as far as balance needs (paper, section V).
 
+pub mod ablation;
 pub mod data;
 pub mod falls;
 pub mod imagination;

@@ -54,6 +54,7 @@ const COLUMNS: [&str; 13] = [
 ];
 
 /// What a run trains with.
+#[derive(Clone)]
 pub struct Equipment {
     /// The robot.
     pub robot: Arc<Robot>,
@@ -64,7 +65,7 @@ pub struct Equipment {
     /// The clips.
     pub clips: Arc<[GoalClip]>,
     /// Threads of forward and backward passes.
-    pub threads: rayon::ThreadPool,
+    pub threads: Arc<rayon::ThreadPool>,
 }
 
 /// A run: the learner, its environments, and how far they are.

@@ -1,4 +1,4 @@
-//! A policy's training that is killed and resumed makes the same weights as one that is left alone.
+//! A training in the simulator that is killed and resumed makes the same weights as one that is left alone.
 
 #![allow(clippy::unwrap_used, reason = "a helper that fails must fail its test")]
 
@@ -10,30 +10,27 @@ use std::{
 
 use emp_models::checkpoint;
 
-/// `emp-train policy` on a small run in `folder`, which saves after every update.
-fn trainer(folder: &Path, threads: usize) -> Command {
+/// `emp-train` with these arguments on a small run in `folder`, which saves after every update.
+fn trainer(arguments: &[&str], folder: &Path, threads: usize) -> Command {
     let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let weights = |kind: &str| repository.join(format!("models/weights/emp27-{kind}.safetensors"));
     let mut command = Command::new(env!("CARGO_BIN_EXE_emp-train"));
     command
-        .args(["policy", "--robot", "emp27", "--robots"])
+        .args(arguments)
+        .args(["--robot", "emp27", "--robots"])
         .arg(repository.join("robots"))
         .arg("--retargeter")
-        .arg(repository.join("models/weights/emp27-retargeter.safetensors"))
-        .args(["--steps", "4096", "--environments", "16", "--horizon", "8"])
-        .args([
-            "--procedural-clips",
-            "2",
-            "--seed",
-            "7",
-            "--save-every",
-            "0",
-        ])
+        .arg(weights("retargeter"))
+        .args(["--seed", "7", "--save-every", "0"])
         .args(["--threads", &threads.to_string()])
         .arg("--out")
         .arg(folder.join("weights.safetensors"))
         .arg("--run")
         .arg(folder.join("run"))
         .stderr(Stdio::null());
+    if arguments[0] != "policy" {
+        command.arg("--policy").arg(weights("policy"));
+    }
     command
 }
 
@@ -55,12 +52,13 @@ fn weights(folder: &Path) -> String {
     metadata.sha256
 }
 
-#[test]
-fn a_killed_run_resumes_bit_for_bit_at_any_number_of_threads() {
+/// Runs a training of `rows` updates once as a whole, once killed after its first checkpoint and resumed.
+fn check(arguments: &[&str], rows: usize) {
     let (whole, killed) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    assert!(trainer(whole.path(), 1).status().unwrap().success());
+    let run = |folder: &Path, threads| trainer(arguments, folder, threads);
+    assert!(run(whole.path(), 1).status().unwrap().success());
 
-    let mut child = trainer(killed.path(), 2).spawn().unwrap();
+    let mut child = run(killed.path(), 2).spawn().unwrap();
     let state = killed.path().join("run/checkpoint.safetensors");
     let start = Instant::now();
     while !state.exists() {
@@ -77,13 +75,30 @@ fn a_killed_run_resumes_bit_for_bit_at_any_number_of_threads() {
         "the run ended before it was killed"
     );
     assert!(
-        !trainer(killed.path(), 2).status().unwrap().success(),
+        !run(killed.path(), 2).status().unwrap().success(),
         "a run must not be overwritten unasked"
     );
-    let mut resumed = trainer(killed.path(), 2);
+    let mut resumed = run(killed.path(), 2);
     assert!(resumed.arg("--resume").status().unwrap().success());
 
     assert_eq!(log(whole.path()), log(killed.path()));
-    assert_eq!(log(whole.path()).len(), 32);
+    assert_eq!(log(whole.path()).len(), rows);
     assert_eq!(weights(whole.path()), weights(killed.path()));
+}
+
+#[test]
+fn a_policy_resumes_bit_for_bit_at_any_number_of_threads() {
+    let arguments = "policy --steps 4096 --environments 16 --horizon 8 --procedural-clips 2";
+    check(&arguments.split(' ').collect::<Vec<_>>(), 32);
+}
+
+/// A small EMP run; an evaluation would write weights before it is killed.
+const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_up=8 \
+                   --set procedural_clips=2 --set evaluation_clips=1 --set optimizer.rows=64 \
+                   --set evaluate_every=1000000";
+
+#[test]
+fn an_emp_that_learns_the_price_of_falls_resumes_bit_for_bit() {
+    let arguments = format!("emp --preset default {EMP}");
+    check(&arguments.split(' ').collect::<Vec<_>>(), 20);
 }

@@ -1,0 +1,185 @@
+//! The paper's ablation of the EMP's losses (section VI): the whole loss, and three trainings that do without a part of it.
+
+use std::{
+    fmt,
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+use anyhow::{Context as _, Result};
+use emp_models::{checkpoint::write_atomically, emp::Emp};
+use emp_robot::Robot;
+use emp_sim::{evaluation::Evaluation, suite::Condition};
+use serde::Serialize;
+
+use super::{judge::Judge, settings::Settings};
+
+/// What is left out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Row {
+    /// Nothing.
+    Full,
+    /// `L_smo`.
+    WithoutSmoothness,
+    /// `L_ori`, imagined and measured.
+    WithoutOrientation,
+    /// `L_cen`, imagined and measured.
+    WithoutCentroid,
+}
+
+impl Row {
+    /// The rows of the table.
+    pub const ALL: [Self; 4] = [
+        Self::Full,
+        Self::WithoutSmoothness,
+        Self::WithoutOrientation,
+        Self::WithoutCentroid,
+    ];
+
+    /// The row as a folder is called.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::WithoutSmoothness => "without-smoothness",
+            Self::WithoutOrientation => "without-orientation",
+            Self::WithoutCentroid => "without-centroid",
+        }
+    }
+
+    /// The settings of the row's training, which has `full` but for a part.
+    pub fn settings(self, full: &Settings) -> Settings {
+        let mut settings = full.clone();
+        let (weights, risk) = (&mut settings.losses.weights, &mut settings.risk);
+        match self {
+            Self::Full => {}
+            Self::WithoutSmoothness => weights.smoothness = 0.0,
+            Self::WithoutOrientation => (weights.orientation, risk.orientation) = (0.0, 0.0),
+            Self::WithoutCentroid => (weights.centroid, risk.centroid) = (0.0, 0.0),
+        }
+        settings
+    }
+}
+
+impl fmt::Display for Row {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Full => "EMP",
+            Self::WithoutSmoothness => "w/o smoothness",
+            Self::WithoutOrientation => "w/o orientation",
+            Self::WithoutCentroid => "w/o centroid",
+        })
+    }
+}
+
+/// The table: the policy alone, then each row, under each condition. [`Display`](fmt::Display) writes Markdown.
+#[derive(Clone, Debug, Serialize)]
+pub struct Table {
+    conditions: Vec<Condition>,
+    rows: Vec<Line>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct Line {
+    name: String,
+    evaluations: Vec<Evaluation>,
+}
+
+/// Evaluates the weights of the rows.
+///
+/// # Errors
+/// When weights cannot be loaded or an evaluation fails.
+pub fn table(judge: &Judge, robot: &Arc<Robot>, weights: &[(Row, PathBuf)]) -> Result<Table> {
+    let mut rows = vec![Line {
+        name: "decoupled policy".to_owned(),
+        evaluations: judge.evaluations(None)?,
+    }];
+    for (row, weights) in weights {
+        rows.push(Line {
+            name: row.to_string(),
+            evaluations: judge.evaluations(Some(Emp::load(weights, Arc::clone(robot))?))?,
+        });
+    }
+    Ok(Table {
+        conditions: judge.trials().to_vec(),
+        rows,
+    })
+}
+
+impl Table {
+    /// Writes ablation.md and ablation.json into a folder.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let json = serde_json::to_string_pretty(self)?;
+        for (name, text) in [("ablation.md", self.to_string()), ("ablation.json", json)] {
+            let path = folder.join(name);
+            write_atomically(&path, text.as_bytes())
+                .with_context(|| format!("writing {}", path.display()))?;
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, condition) in self.conditions.iter().enumerate() {
+            writeln!(f, "{} ({} clips)\n", condition.name(), self.episodes(index))?;
+            writeln!(
+                f,
+                "| | SUC ↑ | MJP ↑ | MSC ↓ N | MBV ↑ | MBA ↑ | MBO ↑ | MUS ↓ | change rad |"
+            )?;
+            writeln!(f, "|---|---|---|---|---|---|---|---|---|")?;
+            for row in &self.rows {
+                let metrics = &row.evaluations[index].all.metrics;
+                writeln!(
+                    f,
+                    "| {} | {:.1} % | {:.3} | {:.2} | {:.3} | {:.3} | {:.3} | {:.2} | {:.4} |",
+                    row.name,
+                    100.0 * metrics.suc.mean,
+                    metrics.mjp.mean,
+                    metrics.msc.mean,
+                    metrics.mbv.mean,
+                    metrics.mba.mean,
+                    metrics.mbo.mean,
+                    metrics.mus.mean,
+                    metrics.change.mean,
+                )?;
+            }
+            writeln!(f)?;
+        }
+        Ok(())
+    }
+}
+
+impl Table {
+    fn episodes(&self, condition: usize) -> usize {
+        let first = self.rows.first();
+        first.map_or(0, |row| row.evaluations[condition].all.episodes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::emp::settings::Preset;
+
+    #[test]
+    fn a_row_leaves_out_one_part_wherever_it_is_weighed() {
+        let mut full = Settings::preset(Preset::Paper);
+        (full.risk.weight, full.risk.centroid) = (1.0, 0.1);
+        assert_eq!(Row::Full.settings(&full), full);
+        for row in &Row::ALL[1..] {
+            let settings = row.settings(&full);
+            let left_out = [
+                settings.losses.weights.smoothness,
+                settings.losses.weights.orientation + settings.risk.orientation,
+                settings.losses.weights.centroid + settings.risk.centroid,
+            ];
+            let zeros = left_out.iter().filter(|weight| **weight == 0.0).count();
+            assert_eq!(zeros, 1, "{row}");
+            assert_eq!(settings.losses.weights.reconstruction, 20.0);
+        }
+    }
+}

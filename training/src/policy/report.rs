@@ -280,7 +280,7 @@ fn failed(error: impl fmt::Display) -> anyhow::Error {
 mod tests {
     use emp_sim::{
         ladder::LadderRow,
-        metrics::{Interval, Metrics},
+        metrics::{Interval, METRICS, Metrics},
     };
 
     use super::*;
@@ -296,7 +296,7 @@ mod tests {
             controller: controller.to_owned(),
             rung: Rung { axis, value },
             episodes: 10,
-            metrics: Metrics::from([interval(1.0 / (1.0 + value)); 8]),
+            metrics: Metrics::from([interval(1.0 / (1.0 + value)); METRICS]),
         };
         let rows = Axis::ALL.into_iter().flat_map(|axis| {
             let values = [0.5, 1.0, 1.5].into_iter();

@@ -38,7 +38,10 @@ impl Cut {
     pub(super) fn all(robot: &Robot) -> Result<Vec<Self>, RobotError> {
         let joints = robot.goal_joints();
         let mut cuts = Vec::new();
-        for (index, &partner) in robot.mirror()?.permutation()[..joints.len()].iter().enumerate() {
+        for (index, &partner) in robot.mirror()?.permutation()[..joints.len()]
+            .iter()
+            .enumerate()
+        {
             if partner < index {
                 continue;
             }
@@ -49,7 +52,8 @@ impl Cut {
                 sender: Sender::Answered,
             });
         }
-        let every = || -> Option<Arc<dyn GoalFilter>> { Some(Arc::new(JointCut::new(robot, |_| true))) };
+        let every =
+            || -> Option<Arc<dyn GoalFilter>> { Some(Arc::new(JointCut::new(robot, |_| true))) };
         let default = joints.iter().map(|joint| joint.default as f32).collect();
         cuts.extend([
             Self {
@@ -88,12 +92,13 @@ impl Observer for Sender {
     fn executed(&mut self, _: &ExecutedFrame<'_>) {}
 }
 
-/// What two names end with alike: a joint's name without its side.
+/// What two names end with alike, from a word's start: a joint's name without its side.
 fn common_name<'a>(left: &'a str, right: &str) -> &'a str {
-    let pairs = left.char_indices().rev().zip(right.chars().rev());
-    let same = pairs.take_while(|((_, a), b)| a == b);
-    let start = same.last().map_or(0, |((index, _), _)| index);
-    left[start..].trim_start_matches('_')
+    let mut words = left.match_indices('_').map(|(index, _)| &left[index + 1..]);
+    if left == right {
+        return left;
+    }
+    words.find(|words| right.ends_with(words)).unwrap_or(left)
 }
 
 /// Cuts some joints about the default pose.
@@ -107,7 +112,9 @@ impl JointCut {
         let joints = robot.goal_joints().iter().enumerate();
         let joints = joints.filter(|(index, _)| is_cut(*index));
         Self {
-            joints: joints.map(|(index, joint)| (index, joint.default as f32)).collect(),
+            joints: joints
+                .map(|(index, joint)| (index, joint.default as f32))
+                .collect(),
         }
     }
 }
@@ -157,7 +164,11 @@ mod tests {
     #[test]
     fn each_cut_leaves_the_rest_alone() {
         let robot = robot();
-        let default: Vec<f32> = robot.goal_joints().iter().map(|joint| joint.default as f32).collect();
+        let default: Vec<f32> = robot
+            .goal_joints()
+            .iter()
+            .map(|joint| joint.default as f32)
+            .collect();
         let asked: Vec<f32> = default.iter().map(|angle| angle + 0.5).collect();
         let small: Vec<f32> = default.iter().map(|angle| angle + 0.4).collect();
         let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6);
@@ -183,8 +194,17 @@ mod tests {
             let (seen, sent) = answer(cut, &asked);
             assert_eq!(seen, sent);
             for (joint, angle) in robot.goal_joints().iter().zip(&seen) {
-                let offset = if joint.name.ends_with(&cut.name) { 0.4 } else { 0.5 };
-                assert!((angle - joint.default as f32 - offset).abs() < 1e-6, "{}: {}", cut.name, joint.name);
+                let offset = if joint.name.ends_with(&cut.name) {
+                    0.4
+                } else {
+                    0.5
+                };
+                assert!(
+                    (angle - joint.default as f32 - offset).abs() < 1e-6,
+                    "{}: {}",
+                    cut.name,
+                    joint.name
+                );
             }
         }
         let (seen, sent) = answer(&mut cuts[8], &asked);

@@ -6,18 +6,17 @@ mod reach;
 mod text;
 mod trace;
 
-use std::sync::Arc;
+use std::{iter::Sum, sync::Arc};
 
 use anyhow::{Context as _, Result, ensure};
 use emp_models::{
     controller::{Controller, GoalFilter},
+    emp::{DangerGate, Emp, EmpFilter},
     policy::Policy,
 };
 use emp_sim::{
     Pool,
-    evaluation::{
-        Evaluation, EvaluationSettings, Observer, Progress, evaluate_observed,
-    },
+    evaluation::{Evaluation, EvaluationSettings, Observer, Progress, evaluate_observed},
     goals::GoalClip,
     metrics::{EpisodeSums, Interval, paired_difference},
     suite::Condition,
@@ -67,15 +66,17 @@ pub struct Falls {
     falls: usize,
     /// Which way it fell.
     directions: Directions,
+    /// Which way it fell with every clip in the mirror.
+    mirrored: Directions,
     /// Where the hands were asked to be 15 to 110 frames before a fall, shares of frames.
     reach_before: Reaches<f64>,
     /// Where they were in all frames.
     reach_ever: Reaches<f64>,
     /// Frames of episodes without a fall.
     standing: Option<OperatingPoint>,
-    /// Median time from when |roll| + |pitch| passed `tilted` for good to the fall, seconds.
+    /// Median time from when the tilt passed `tilted` for good to the fall, seconds.
     seconds_from_tilt: Option<f64>,
-    /// 99th percentile of |roll| + |pitch| in episodes without a fall, rad.
+    /// 99th percentile of the angle between the base's vertical axis and the world's in episodes without a fall, rad.
     tilted: Option<f64>,
     /// How well numbers tell frames before a fall from frames of episodes without one.
     signals: Vec<Signal>,
@@ -134,8 +135,8 @@ pub struct FallRun<'a> {
     pub pool: &'a Pool,
     /// The policy.
     pub policy: &'a Arc<Policy>,
-    /// Judges danger beside the policy without changing a goal; none: no regloss.
-    pub judge: Option<Arc<dyn GoalFilter>>,
+    /// Judges danger without changing a goal; none: no regloss.
+    pub emp: Option<Arc<Emp>>,
     /// Motion.
     pub clips: &'a [GoalClip],
     /// Conditions to fall under.
@@ -152,6 +153,8 @@ struct Traced {
     raw: Evaluation,
     /// Frames of the raw episodes, by number.
     episodes: Vec<Vec<Moment>>,
+    /// Which way the robot falls with the clips in the mirror.
+    mirrored: Directions,
     /// The same episodes with one thing cut, by its name.
     cuts: Vec<(String, Vec<EpisodeSums>)>,
 }
@@ -163,8 +166,21 @@ struct Traced {
 pub fn report(run: &FallRun<'_>, progress: &mut dyn Progress) -> Result<FallReport> {
     let nominal = trace(run, Condition::Nominal, progress)?;
     let mut traced = Vec::new();
+    let mirror = run.policy.robot().mirror()?;
+    let images: Vec<GoalClip> = run
+        .clips
+        .iter()
+        .map(|clip| clip.mirrored(&mirror))
+        .collect();
+    let mirrored = FallRun {
+        clips: &images,
+        emp: None,
+        ..*run
+    };
     for &condition in run.conditions {
         let mut one = trace(run, condition, progress)?;
+        let image = trace(&mirrored, condition, progress)?;
+        one.mirrored = Directions::of(image.of(true));
         if run.cuts {
             one.cuts = cut(run, condition, progress)?;
         }
@@ -193,19 +209,34 @@ fn evaluation(
 ) -> Result<Evaluation> {
     let controller = Controller::new(Arc::clone(run.policy), filter);
     let settings: EvaluationSettings = condition.settings(run.policy.robot(), run.seed);
-    let evaluation = evaluate_observed(run.pool, &controller, run.clips, &settings, progress, observer)?;
-    ensure!(evaluation.complete, "interrupted under {}", condition.name());
+    let evaluation = evaluate_observed(
+        run.pool,
+        &controller,
+        run.clips,
+        &settings,
+        progress,
+        observer,
+    )?;
+    ensure!(
+        evaluation.complete,
+        "interrupted under {}",
+        condition.name()
+    );
     Ok(evaluation)
 }
 
 fn trace(run: &FallRun<'_>, condition: Condition, progress: &mut dyn Progress) -> Result<Traced> {
     let mut tracer = Tracer::new(run.policy.robot());
-    let judge = run.judge.clone();
+    let judge = run.emp.clone().map(|emp| -> Arc<dyn GoalFilter> {
+        let never = DangerGate::Regloss(f32::INFINITY);
+        Arc::new(EmpFilter::when_danger(emp, never))
+    });
     let raw = evaluation(run, condition, judge, &mut tracer, progress)?;
     Ok(Traced {
         condition,
         raw,
         episodes: tracer.episodes,
+        mirrored: Directions::default(),
         cuts: Vec::new(),
     })
 }
@@ -224,11 +255,17 @@ fn cut(
 }
 
 fn sums(evaluation: &Evaluation) -> Vec<EpisodeSums> {
-    evaluation.results.iter().map(|result| result.sums).collect()
+    evaluation
+        .results
+        .iter()
+        .map(|result| result.sums)
+        .collect()
 }
 
 fn fallen(sums: &[EpisodeSums]) -> usize {
-    sums.iter().filter(|episode| episode.sums.suc == 0.0).count()
+    sums.iter()
+        .filter(|episode| episode.sums.suc == 0.0)
+        .count()
 }
 
 impl Traced {
@@ -241,7 +278,8 @@ impl Traced {
 
     /// Frames of episodes without a fall, once the robot has settled.
     fn standing(&self) -> impl Iterator<Item = &Moment> + Clone {
-        self.of(false).flat_map(|frames| frames.iter().skip(SETTLING))
+        self.of(false)
+            .flat_map(|frames| frames.iter().skip(SETTLING))
     }
 
     /// Frames whose episode ends in a fall so many frames later.
@@ -266,10 +304,13 @@ fn falls(traced: &[Traced], nominal: &OperatingPoint, rate: f64, seed: u64) -> F
         episodes: raw.len(),
         falls: fallen(&raw),
         directions: Directions::of(ends.clone()),
+        mirrored: traced.iter().map(|one| one.mirrored).sum(),
         reach_before: Reaches::shares(before.map(|moment| moment.reach)),
         reach_ever: Reaches::shares(ever.map(|moment| moment.reach)),
         standing: OperatingPoint::of(standing),
-        seconds_from_tilt: tilted.and_then(|tilted| frames_from_tilt(ends, tilted)).map(|frames| frames / rate),
+        seconds_from_tilt: tilted
+            .and_then(|tilted| frames_from_tilt(ends, tilted))
+            .map(|frames| frames / rate),
         tilted,
         signals: SIGNALS
             .iter()
@@ -324,6 +365,17 @@ impl Directions {
     }
 }
 
+impl Sum for Directions {
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), |sum, one| Self {
+            forward: sum.forward + one.forward,
+            backward: sum.backward + one.backward,
+            left: sum.left + one.left,
+            right: sum.right + one.right,
+        })
+    }
+}
+
 impl OperatingPoint {
     /// Of frames in which the robot stands; none of none.
     fn of<'a>(standing: impl Iterator<Item = &'a Moment> + Clone) -> Option<Self> {
@@ -346,7 +398,9 @@ fn spread(points: impl Iterator<Item = Vector2<f64>>) -> Option<[[f64; 2]; 2]> {
     }
     let count = points.len() as f64;
     let mean = points.iter().sum::<Vector2<f64>>() / count;
-    let squares = points.iter().map(|point| (point - mean).component_mul(&(point - mean)));
+    let squares = points
+        .iter()
+        .map(|point| (point - mean).component_mul(&(point - mean)));
     let deviation = (squares.sum::<Vector2<f64>>() / count).map(f64::sqrt);
     Some([mean.into(), deviation.into()])
 }
@@ -355,21 +409,36 @@ fn spread(points: impl Iterator<Item = Vector2<f64>>) -> Option<[[f64; 2]; 2]> {
 type Value = fn(&Moment, &OperatingPoint) -> Option<f64>;
 
 /// Names of signs of falls, and their values.
-const SIGNALS: [(&str, Value); 9] = [
-    ("static CoM: distance from the feet's middle", |moment, _| Some(moment.static_com.norm())),
-    ("static CoM: distance from its usual place", |moment, usual| {
-        Some((moment.static_com - Vector2::from(usual.quasi_static)).norm())
+const SIGNALS: [(&str, Value); 10] = [
+    (
+        "static CoM: distance from the feet's middle",
+        |moment, _| Some(moment.static_com.norm()),
+    ),
+    (
+        "static CoM: distance from its usual place",
+        |moment, usual| Some((moment.static_com - Vector2::from(usual.quasi_static)).norm()),
+    ),
+    ("static CoM: backward", |moment, _| {
+        Some(-moment.static_com.x)
     }),
-    ("static CoM: forward", |moment, _| Some(moment.static_com.x)),
-    ("static CoM: backward", |moment, _| Some(-moment.static_com.x)),
-    ("measured CoM: distance from the feet's middle", |moment, _| {
-        Some(moment.measured_com.norm())
+    ("static CoM: to the right", |moment, _| {
+        Some(-moment.static_com.y)
     }),
-    ("measured CoM: distance from its usual place", |moment, usual| {
-        Some((moment.measured_com - Vector2::from(usual.measured)).norm())
+    (
+        "measured CoM: distance from the feet's middle",
+        |moment, _| Some(moment.measured_com.norm()),
+    ),
+    (
+        "measured CoM: distance from its usual place",
+        |moment, usual| Some((moment.measured_com - Vector2::from(usual.measured)).norm()),
+    ),
+    ("measured CoM: backward", |moment, _| {
+        Some(-moment.measured_com.x)
     }),
-    ("measured CoM: forward", |moment, _| Some(moment.measured_com.x)),
-    ("tilt |roll| + |pitch|", |moment, _| Some(moment.tilt)),
+    ("measured CoM: to the right", |moment, _| {
+        Some(-moment.measured_com.y)
+    }),
+    ("tilt", |moment, _| Some(moment.tilt)),
     ("regloss", |moment, _| moment.regloss),
 ];
 

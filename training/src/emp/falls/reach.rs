@@ -145,12 +145,18 @@ mod tests {
         let one = reach(&[("left_shoulder_pitch", -3.0)]);
         assert!(one.overhead && !one.both_overhead, "{one:?}");
         let forward = reach(&[("shoulder_pitch", -1.57)]);
-        assert!(forward.forward && !forward.overhead && !forward.behind, "{forward:?}");
+        assert!(
+            forward.forward && !forward.overhead && !forward.behind,
+            "{forward:?}"
+        );
         let side = reach(&[("left_shoulder_roll", 1.5), ("right_shoulder_roll", -1.5)]);
         assert!(side.sideways && !side.forward, "{side:?}");
         let behind = reach(&[("shoulder_pitch", 0.8)]);
         assert!(behind.behind && !behind.low, "{behind:?}");
         let shares = Reaches::shares([up, one, forward, side].into_iter());
-        assert_eq!((shares.overhead, shares.both_overhead, shares.low), (0.5, 0.25, 0.0));
+        assert_eq!(
+            (shares.overhead, shares.both_overhead, shares.low),
+            (0.5, 0.25, 0.0)
+        );
     }
 }

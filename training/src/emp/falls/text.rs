@@ -6,8 +6,13 @@ use super::{CutFalls, Directions, FallReport, Falls, LEADS, OperatingPoint, Reac
 
 impl fmt::Display for FallReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { robot, clips, seed, .. } = self;
-        writeln!(f, "{robot}, {clips} clips under each condition, seed {seed}.\n")?;
+        let Self {
+            robot, clips, seed, ..
+        } = self;
+        writeln!(
+            f,
+            "{robot}, {clips} clips under each condition, seed {seed}.\n"
+        )?;
         self.write_falls(f)?;
         self.write_reach(f)?;
         self.write_cuts(f)?;
@@ -27,17 +32,25 @@ impl FallReport {
     fn write_falls(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "| condition | episodes | falls | forward | backward | left | right | p99 of the tilt where it stands, rad | seconds from there to the fall, median |"
+            "| condition | episodes | falls | forward | backward | left | right | with mirrored goals: left | right | p99 of the tilt where it stands, rad | seconds from there to the fall, median |"
         )?;
-        writeln!(f, "|---|---|---|---|---|---|---|---|---|")?;
+        writeln!(f, "|---|---|---|---|---|---|---|---|---|---|---|")?;
         for (name, falls) in self.rows() {
-            let Directions { forward, backward, left, right } = falls.directions;
+            let mirrored = falls.mirrored;
+            let Directions {
+                forward,
+                backward,
+                left,
+                right,
+            } = falls.directions;
             writeln!(
                 f,
-                "| {name} | {} | {} ({:.1} %) | {forward} | {backward} | {left} | {right} | {} | {} |",
+                "| {name} | {} | {} ({:.1} %) | {forward} | {backward} | {left} | {right} | {} | {} | {} | {} |",
                 falls.episodes,
                 falls.falls,
                 100.0 * falls.falls as f64 / falls.episodes.max(1) as f64,
+                mirrored.left,
+                mirrored.right,
                 number(falls.tilted),
                 number(falls.seconds_from_tilt),
             )?;
@@ -55,7 +68,11 @@ impl FallReport {
         writeln!(f, "|---|---|---|---|---|---|---|")?;
         for (name, falls) in self.rows() {
             write!(f, "| {name} ")?;
-            let pairs = falls.reach_before.array().into_iter().zip(falls.reach_ever.array());
+            let pairs = falls
+                .reach_before
+                .array()
+                .into_iter()
+                .zip(falls.reach_ever.array());
             for (before, ever) in pairs {
                 write!(f, "| {:.0} % / {:.0} % ", 100.0 * before, 100.0 * ever)?;
             }
@@ -69,21 +86,39 @@ impl FallReport {
             return Ok(());
         }
         let conditions: Vec<&str> = self.conditions.iter().map(falls_name).collect();
-        writeln!(f, "Falls with one thing cut by a fifth about the default pose, on the same seeds.\n")?;
-        writeln!(f, "| cut | {} | all | change of the share of falls (95 %, paired) |", conditions.join(" | "))?;
+        writeln!(
+            f,
+            "Falls with one thing cut by a fifth about the default pose, on the same seeds.\n"
+        )?;
+        writeln!(
+            f,
+            "| cut | {} | all | change of the share of falls (95 %, paired) |",
+            conditions.join(" | ")
+        )?;
         writeln!(f, "|---|{}---|---|", "---|".repeat(conditions.len()))?;
         write!(f, "| nothing |")?;
         for falls in &self.conditions {
             write!(f, " {} |", falls.falls)?;
         }
         writeln!(f, " {} | |", self.all.falls)?;
-        for (index, CutFalls { name, falls, change }) in self.all.cuts.iter().enumerate() {
+        for (
+            index,
+            CutFalls {
+                name,
+                falls,
+                change,
+            },
+        ) in self.all.cuts.iter().enumerate()
+        {
             write!(f, "| {name} |")?;
             for condition in &self.conditions {
                 write!(f, " {} |", condition.cuts[index].falls)?;
             }
             let [mean, low, high] = [change.mean, change.low, change.high].map(|x| 100.0 * x);
-            writeln!(f, " {falls} | {mean:+.1} ({low:+.1} to {high:+.1}) points |")?;
+            writeln!(
+                f,
+                " {falls} | {mean:+.1} ({low:+.1} to {high:+.1}) points |"
+            )?;
         }
         writeln!(f)
     }
@@ -114,7 +149,12 @@ impl FallReport {
         let rows = self.rows().map(|(name, falls)| (name, falls.standing));
         for (name, point) in [("nominal", Some(self.nominal))].into_iter().chain(rows) {
             let Some(point) = point else { continue };
-            let OperatingPoint { measured, measured_deviation, quasi_static, quasi_static_deviation } = point;
+            let OperatingPoint {
+                measured,
+                measured_deviation,
+                quasi_static,
+                quasi_static_deviation,
+            } = point;
             writeln!(
                 f,
                 "| {name} | {} | {} |",
@@ -135,6 +175,7 @@ fn number(value: Option<f64>) -> String {
 }
 
 fn centimetres(mean: [f64; 2], deviation: [f64; 2]) -> String {
-    let [x, y, dx, dy] = [mean[0], mean[1], deviation[0], deviation[1]].map(|metres| 100.0 * metres);
+    let [x, y, dx, dy] =
+        [mean[0], mean[1], deviation[0], deviation[1]].map(|metres| 100.0 * metres);
     format!("{x:+.2} ({dx:.2}) / {y:+.2} ({dy:.2})")
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use emp_models::observation::{projected_gravity, roll_pitch_yaw};
+use emp_models::observation::projected_gravity;
 use emp_robot::Robot;
 use emp_sim::evaluation::{ExecutedFrame, Observer};
 use nalgebra::Vector2;
@@ -17,7 +17,7 @@ pub(super) struct Moment {
     pub(super) static_com: Vector2<f64>,
     /// From the feet's middle to the centre of mass, as simulated, heading frame, metres.
     pub(super) measured_com: Vector2<f64>,
-    /// |roll| + |pitch| of the base, rad.
+    /// Angle between the base's vertical axis and the world's, rad.
     pub(super) tilt: f64,
     /// Direction of gravity along the base's forward and left axes: to where it leans.
     pub(super) lean: Vector2<f64>,
@@ -65,12 +65,11 @@ impl Tracer {
 
 impl Observer for Tracer {
     fn executed(&mut self, frame: &ExecutedFrame<'_>) {
-        let [roll, pitch, _] = roll_pitch_yaw(&frame.reading.orientation);
         let gravity = projected_gravity(&frame.reading.orientation);
         let moment = Moment {
             static_com: self.static_com(&frame.output.goal),
             measured_com: frame.reading.center_of_mass_over_feet(),
-            tilt: roll.abs() + pitch.abs(),
+            tilt: (-gravity[2]).clamp(-1.0, 1.0).acos(),
             lean: Vector2::new(gravity[0], gravity[1]),
             reach: self.reach.measure(frame.asked),
             regloss: frame.output.risk.map(|risk| f64::from(risk.regloss)),

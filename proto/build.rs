@@ -5,7 +5,7 @@ use std::{env, error::Error, fs, path::PathBuf};
 
 use prost::Message as _;
 
-const FILES: [&str; 7] = [
+const FILES: [&str; 8] = [
     "emp/v1/filter.proto",
     "emp/v1/frame.proto",
     "emp/v1/model_service.proto",
@@ -13,6 +13,7 @@ const FILES: [&str; 7] = [
     "emp/v1/pose.proto",
     "emp/v1/robot_state.proto",
     "emp/v1/rollout_service.proto",
+    "emp/v1/teleoperation.proto",
 ];
 
 fn main() -> Result<(), Box<dyn Error>> {

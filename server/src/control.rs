@@ -313,3 +313,76 @@ fn by_mode<O>(
     answers.sort_unstable_by_key(|(place, _)| *place);
     Ok(answers.into_iter().map(|(_, answer)| answer).collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use emp_models::observation::HISTORY;
+
+    use super::*;
+
+    fn robot() -> Arc<Robot> {
+        Arc::new(Robot::load("../robots/emp27".as_ref()).expect("it ships"))
+    }
+
+    fn input(robot: &Robot, mode: EmpMode, number: f32) -> ControlInput {
+        let goals = robot.goal_joints().len();
+        ControlInput {
+            mode,
+            state: ControllerState::new(ObservationLayout::new(robot, HISTORY)),
+            joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
+            orientation: UnitQuaternion::identity(),
+            goal: vec![number; goals],
+        }
+    }
+
+    #[test]
+    fn a_batch_is_split_by_mode_and_keeps_its_order() {
+        let robot = robot();
+        let modes = [
+            EmpMode::On,
+            EmpMode::Off,
+            EmpMode::WhenDanger,
+            EmpMode::On,
+            EmpMode::Off,
+        ];
+        let batch: Vec<_> = (0_u8..)
+            .zip(modes)
+            .map(|(number, mode)| input(&robot, mode, f32::from(number)))
+            .collect();
+        let mut calls = Vec::new();
+        let answers = by_mode(&batch, |mode, inputs| {
+            assert!(inputs.iter().all(|input| input.mode == mode));
+            calls.push((mode, inputs.len()));
+            Ok(inputs.iter().map(|input| (mode, input.goal[0])).collect())
+        });
+        let expected: Vec<_> = modes.into_iter().zip([0.0, 1.0, 2.0, 3.0, 4.0]).collect();
+        assert_eq!(answers.expect("no failure"), expected);
+        assert_eq!(
+            calls,
+            [
+                (EmpMode::Off, 2),
+                (EmpMode::On, 2),
+                (EmpMode::WhenDanger, 1)
+            ]
+        );
+    }
+
+    #[test]
+    fn weights_are_loaded_each_time_anew_and_an_emp_that_has_gone_is_an_error() {
+        let robot = robot();
+        let policy = PathBuf::from("../models/weights/emp27-policy.safetensors");
+        let mut load = Controllers::load(policy.clone(), None, Arc::clone(&robot));
+        for _ in 0..2 {
+            let mut controllers = load().expect("the policy ships");
+            let batch = [input(&robot, EmpMode::Off, 0.0)];
+            assert_eq!(controllers.run(&batch).expect("an answer").len(), 1);
+            let batch = [input(&robot, EmpMode::On, 0.0)];
+            let error = controllers.run(&batch).expect_err("no EMP");
+            assert!(error.to_string().contains("emp27 has no EMP"), "{error}");
+        }
+        let gone = PathBuf::from("../models/weights/gone.safetensors");
+        let error = Controllers::load(policy, Some(gone), robot)().err();
+        let error = error.expect("no file").to_string();
+        assert!(error.contains("gone.safetensors"), "{error}");
+    }
+}

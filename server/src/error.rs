@@ -72,6 +72,9 @@ pub(crate) enum ServiceError {
     ModelUnavailable,
     #[error("the job failed: {0}")]
     JobFailed(String),
+    /// A session has one robot and one operator at most.
+    #[error("session {session:?} has its {seat} already")]
+    SeatTaken { session: String, seat: &'static str },
     #[error("the server is shutting down")]
     ShuttingDown,
     /// The transport ended the call (reset by the client, message too large, not decodable): its status stands.
@@ -107,6 +110,7 @@ impl ServiceError {
             Self::InvalidField(_) | Self::NotServed { .. } => Code::InvalidArgument,
             Self::NotFound { .. } => Code::NotFound,
             Self::DeadlineExceeded => Code::DeadlineExceeded,
+            Self::SeatTaken { .. } => Code::AlreadyExists,
             Self::Overloaded { .. } => Code::ResourceExhausted,
             Self::ModelFailed(_) | Self::JobFailed(_) => Code::Internal,
             Self::ModelUnavailable | Self::ShuttingDown => Code::Unavailable,
@@ -124,6 +128,7 @@ impl ServiceError {
             Self::Overloaded { .. } => "OVERLOADED",
             Self::ModelFailed(_) => "MODEL_FAILED",
             Self::JobFailed(_) => "JOB_FAILED",
+            Self::SeatTaken { .. } => "SEAT_TAKEN",
             Self::ModelUnavailable => "MODEL_UNAVAILABLE",
             Self::ShuttingDown => "SHUTTING_DOWN",
             Self::Transport(_) => "TRANSPORT",
@@ -143,6 +148,10 @@ impl ServiceError {
                     ("served", served.clone()),
                 ]
             }
+            Self::SeatTaken { session, seat } => vec![
+                ("session", session.clone()),
+                ("seat", (*seat).to_owned()),
+            ],
             _ => Vec::new(),
         };
         pairs

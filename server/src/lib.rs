@@ -25,6 +25,7 @@ mod rollouts;
 mod serve;
 mod session;
 mod settings;
+mod teleoperation;
 mod wire;
 
 pub use backend::{Backend, BackendError, BoxedBackend, Build, RetargetBackend};
@@ -32,5 +33,5 @@ pub use catalog::{Catalog, CatalogError};
 pub use serve::{Drain, ServeError, Server};
 pub use settings::{
     BatchingSettings, DEFAULT_SETTINGS, LogFormat, LogSettings, Overrides, RolloutSettings,
-    Settings, SettingsError, ShutdownSettings, StreamSettings,
+    Settings, SettingsError, ShutdownSettings, StreamSettings, TeleoperationSettings,
 };

@@ -10,8 +10,9 @@ use std::{
 use emp_models::retarget::RetargetInput;
 use emp_proto::v1::{
     FilterGoalRequest, FilterGoalResponse, FrameHeader, RetargetRequest, RetargetResponse,
-    StepPolicyRequest, StepPolicyResponse, StreamFilterGoalRequest, StreamPolicyRequest,
-    StreamRetargetRequest, motion_service_server::MotionService,
+    StepPolicyRequest, StepPolicyResponse, StreamFilterGoalRequest, StreamFilterGoalResponse,
+    StreamPolicyRequest, StreamPolicyResponse, StreamRetargetRequest, StreamRetargetResponse,
+    TeleoperateRequest, TeleoperateResponse, motion_service_server::MotionService,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::Stream;
@@ -29,7 +30,8 @@ use crate::{
     queue::{Answer, Priority},
     robot_state::{self, Past},
     session::{self, FilterStream, Kind, PolicyStream, RetargetStream, SessionContext},
-    settings::StreamSettings,
+    settings::Settings,
+    teleoperation::{self, Sessions, TeleoperationContext},
     wire,
 };
 
@@ -44,20 +46,26 @@ pub(crate) struct Motion {
     drain: CancellationToken,
     places: Arc<Semaphore>,
     buffer: usize,
+    teleoperation: TeleoperationContext,
 }
 
 impl Motion {
     pub(crate) fn new(
         catalog: Arc<Catalog>,
-        streams: &StreamSettings,
+        settings: &Settings,
         drain: CancellationToken,
     ) -> Self {
+        let streams = &settings.streams;
         let places = streams.max_open.get().min(Semaphore::MAX_PERMITS);
         Self {
             catalog,
             drain,
             places: Arc::new(Semaphore::new(places)),
             buffer: streams.buffer.get(),
+            teleoperation: TeleoperationContext {
+                sessions: Arc::new(Sessions::new(streams.buffer.get())),
+                guard: settings.teleoperation.guard(),
+            },
         }
     }
 
@@ -177,7 +185,17 @@ impl Motion {
     fn open_session<K: Kind>(
         &self,
         request: Request<Streaming<K::Request>>,
-    ) -> Result<SessionStream<K>, ServiceError> {
+    ) -> Result<SessionStream<K::Response>, ServiceError> {
+        self.open(request, session::run::<K>)
+    }
+
+    /// Finds a place for a stream and serves it on a task of its own: the response's headers go out at once, whatever the
+    /// client sends first.
+    fn open<Q, R: Send + 'static, S: Future<Output = ()> + Send + 'static>(
+        &self,
+        request: Request<Streaming<Q>>,
+        serve: impl FnOnce(SessionContext, Streaming<Q>, mpsc::Sender<Result<R, Status>>) -> S,
+    ) -> Result<SessionStream<R>, ServiceError> {
         if self.drain.is_cancelled() {
             return Err(ServiceError::ShuttingDown);
         }
@@ -196,9 +214,7 @@ impl Motion {
             drain: self.drain.clone(),
             deadline,
         };
-        // The session has a task of its own: the response's headers go out at once, whatever the client sends first.
-        let session = session::run::<K>(context, request.into_inner(), sender);
-        tokio::spawn(session.in_current_span());
+        tokio::spawn(serve(context, request.into_inner(), sender).in_current_span());
         Ok(SessionStream {
             responses,
             _permit: permit,
@@ -247,13 +263,13 @@ async fn compute<I: Send + 'static, O: Send + 'static>(
 }
 
 /// A session's answers. It holds the stream's place until the transport has let go of it.
-pub(crate) struct SessionStream<K: Kind> {
-    responses: mpsc::Receiver<session::Response<K>>,
+pub(crate) struct SessionStream<R> {
+    responses: mpsc::Receiver<Result<R, Status>>,
     _permit: OwnedSemaphorePermit,
 }
 
-impl<K: Kind> Stream for SessionStream<K> {
-    type Item = session::Response<K>;
+impl<R> Stream for SessionStream<R> {
+    type Item = Result<R, Status>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         self.responses.poll_recv(context)
@@ -269,13 +285,13 @@ impl MotionService for Motion {
         Ok(Response::new(self.retarget_one(request).await?))
     }
 
-    type StreamRetargetStream = SessionStream<RetargetStream>;
+    type StreamRetargetStream = SessionStream<StreamRetargetResponse>;
 
     async fn stream_retarget(
         &self,
         request: Request<Streaming<StreamRetargetRequest>>,
-    ) -> Result<Response<SessionStream<RetargetStream>>, Status> {
-        Ok(Response::new(self.open_session(request)?))
+    ) -> Result<Response<SessionStream<StreamRetargetResponse>>, Status> {
+        Ok(Response::new(self.open_session::<RetargetStream>(request)?))
     }
 
     async fn filter_goal(
@@ -285,13 +301,13 @@ impl MotionService for Motion {
         Ok(Response::new(self.filter_one(request).await?))
     }
 
-    type StreamFilterGoalStream = SessionStream<FilterStream>;
+    type StreamFilterGoalStream = SessionStream<StreamFilterGoalResponse>;
 
     async fn stream_filter_goal(
         &self,
         request: Request<Streaming<StreamFilterGoalRequest>>,
-    ) -> Result<Response<SessionStream<FilterStream>>, Status> {
-        Ok(Response::new(self.open_session(request)?))
+    ) -> Result<Response<SessionStream<StreamFilterGoalResponse>>, Status> {
+        Ok(Response::new(self.open_session::<FilterStream>(request)?))
     }
 
     async fn step_policy(
@@ -301,12 +317,25 @@ impl MotionService for Motion {
         Ok(Response::new(self.step_one(request).await?))
     }
 
-    type StreamPolicyStream = SessionStream<PolicyStream>;
+    type StreamPolicyStream = SessionStream<StreamPolicyResponse>;
 
     async fn stream_policy(
         &self,
         request: Request<Streaming<StreamPolicyRequest>>,
-    ) -> Result<Response<SessionStream<PolicyStream>>, Status> {
-        Ok(Response::new(self.open_session(request)?))
+    ) -> Result<Response<SessionStream<StreamPolicyResponse>>, Status> {
+        Ok(Response::new(self.open_session::<PolicyStream>(request)?))
+    }
+
+    type TeleoperateStream = SessionStream<TeleoperateResponse>;
+
+    async fn teleoperate(
+        &self,
+        request: Request<Streaming<TeleoperateRequest>>,
+    ) -> Result<Response<SessionStream<TeleoperateResponse>>, Status> {
+        let teleoperation = self.teleoperation.clone();
+        let serve = |context, inbound, outbound| {
+            teleoperation::run(context, teleoperation, inbound, outbound)
+        };
+        Ok(Response::new(self.open(request, serve)?))
     }
 }

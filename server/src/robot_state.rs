@@ -31,21 +31,10 @@ impl ControlPeriod {
         goal: &[f32],
         robot: &Robot,
     ) -> Result<Self, FieldError> {
-        let missing = |field: &str| FieldError::new(format!("{prefix}{field}"), "it is missing");
-        let state = state.ok_or_else(|| missing("state"))?;
-        check::angles(
-            &format!("{prefix}state.joint_positions"),
-            &state.joint_positions,
-            robot.joints(),
-        )?;
-        let orientation = state
-            .base_orientation
-            .as_ref()
-            .ok_or_else(|| missing("state.base_orientation"))?;
-        let orientation = check::rotation(&format!("{prefix}state.base_orientation"), orientation)?;
+        let (joint_positions, orientation) = read_state(&format!("{prefix}state"), state, robot)?;
         check::angles(&format!("{prefix}goal"), goal, robot.goal_joints().iter())?;
         Ok(Self {
-            joint_positions: state.joint_positions.clone(),
+            joint_positions,
             orientation,
             goal: goal.to_vec(),
         })
@@ -66,6 +55,25 @@ impl ControlPeriod {
             goal,
         }
     }
+}
+
+/// Reads a robot's joint positions and the orientation of its base; `path` is where they stand in their message.
+pub(crate) fn read_state(
+    path: &str,
+    state: Option<&v1::RobotState>,
+    robot: &Robot,
+) -> Result<(Vec<f32>, UnitQuaternion<f64>), FieldError> {
+    let state = state.ok_or_else(|| FieldError::new(path, "it is missing"))?;
+    let positions = &state.joint_positions;
+    check::angles(
+        &format!("{path}.joint_positions"),
+        positions,
+        robot.joints(),
+    )?;
+    let path = format!("{path}.base_orientation");
+    let orientation = state.base_orientation.as_ref();
+    let orientation = orientation.ok_or_else(|| FieldError::new(&path, "it is missing"))?;
+    Ok((positions.clone(), check::rotation(&path, orientation)?))
 }
 
 /// The mode that a field asks for; `default` where it asks for none.

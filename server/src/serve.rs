@@ -126,11 +126,7 @@ impl Server {
                 // So that grpcurl can print the details of an error.
                 .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET)
         };
-        let motion = Motion::new(
-            Arc::clone(&self.catalog),
-            &self.settings.streams,
-            shutdown.clone(),
-        );
+        let motion = Motion::new(Arc::clone(&self.catalog), &self.settings, shutdown.clone());
         let models = Models::new(Arc::clone(&self.catalog));
         let rollouts = Rollouts::new(
             Arc::clone(&self.catalog),

@@ -8,10 +8,15 @@ use std::{
 };
 
 use config::{Config, ConfigError, Environment, File, FileFormat};
+use emp_models::guard::GuardSettings;
 use serde::Deserialize;
 
 /// The shipped defaults, comments included.
 pub const DEFAULT_SETTINGS: &str = include_str!("default.toml");
+
+/// Bounds of how long a guard may wait or take, seconds.
+const SHORTEST_WAIT: f64 = 0.05;
+const LONGEST_WAIT: f64 = 60.0;
 
 /// Every setting. What each means and its default: [`DEFAULT_SETTINGS`].
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -29,6 +34,8 @@ pub struct Settings {
     pub batching: BatchingSettings,
     /// Open streams.
     pub streams: StreamSettings,
+    /// The guards around a robot that is teleoperated.
+    pub teleoperation: TeleoperationSettings,
     /// Evaluations and rollouts.
     pub rollouts: RolloutSettings,
     /// The end.
@@ -82,6 +89,68 @@ pub struct StreamSettings {
     pub max_open: NonZeroUsize,
     /// Most frames of one stream that wait inside the server.
     pub buffer: NonZeroUsize,
+}
+
+/// The guards around a robot that is teleoperated.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TeleoperationSettings {
+    /// How long a blend takes at least, seconds.
+    pub ramp_seconds: f64,
+    /// Age at which a pose is stale, seconds.
+    pub stale_after: f64,
+    /// Age of the pose at which the robot returns to its default pose, seconds.
+    pub return_after: f64,
+}
+
+impl TeleoperationSettings {
+    /// As the guards take them; values that are out of range, which settings that were loaded never are, become zero.
+    pub(crate) fn guard(&self) -> GuardSettings {
+        let seconds = |seconds| Duration::try_from_secs_f64(seconds).unwrap_or_default();
+        GuardSettings {
+            ramp: seconds(self.ramp_seconds),
+            stale_after: seconds(self.stale_after),
+            return_after: seconds(self.return_after),
+        }
+    }
+
+    fn check(&self) -> Result<(), SettingsError> {
+        let Self {
+            ramp_seconds,
+            stale_after,
+            return_after,
+        } = *self;
+        let checks = [
+            (
+                "teleoperation.ramp_seconds",
+                ramp_seconds,
+                0.0..=LONGEST_WAIT,
+                "0 to 60 seconds",
+            ),
+            (
+                "teleoperation.stale_after",
+                stale_after,
+                SHORTEST_WAIT..=LONGEST_WAIT,
+                "0.05 to 60 seconds",
+            ),
+            (
+                "teleoperation.return_after",
+                return_after,
+                stale_after..=f64::MAX,
+                "at least teleoperation.stale_after",
+            ),
+        ];
+        for (key, found, range, expected) in checks {
+            if !range.contains(&found) || Duration::try_from_secs_f64(found).is_err() {
+                return Err(SettingsError::Range {
+                    key,
+                    found: found.to_string(),
+                    expected,
+                });
+            }
+        }
+        Ok(())
+    }
 }
 
 /// Evaluations and rollouts.
@@ -174,6 +243,7 @@ impl Settings {
     }
 
     fn check(&self) -> Result<(), SettingsError> {
+        self.teleoperation.check()?;
         let grace = self.shutdown.grace_seconds;
         if Duration::try_from_secs_f64(grace).is_err() {
             let (key, expected) = ("shutdown.grace_seconds", "zero or more seconds");
@@ -273,6 +343,16 @@ mod tests {
         assert!(message("listen = \"nowhere\"").contains("listen"));
         assert!(message("[log]\nformat = \"xml\"").contains("xml"));
         assert!(message("[shutdown]\ngrace_seconds = -1.0").contains("shutdown.grace_seconds"));
+        for (setting, key) in [
+            ("ramp_seconds = -1.0", "teleoperation.ramp_seconds"),
+            ("ramp_seconds = nan", "teleoperation.ramp_seconds"),
+            ("stale_after = 0.0", "teleoperation.stale_after"),
+            ("stale_after = 3.0", "teleoperation.return_after"),
+            ("return_after = inf", "teleoperation.return_after"),
+        ] {
+            let refused = message(&format!("[teleoperation]\n{setting}"));
+            assert!(refused.contains(key), "{setting}: {refused}");
+        }
         let unknown = layered(None, &[("EMP_SERVER__LISTN", "x")], Overrides::default());
         assert!(unknown.expect_err("refused").to_string().contains("listn"));
     }

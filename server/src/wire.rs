@@ -162,7 +162,7 @@ pub(crate) fn count(count: usize) -> u32 {
     u32::try_from(count).unwrap_or(u32::MAX)
 }
 
-fn duration(duration: Duration) -> prost_types::Duration {
+pub(crate) fn duration(duration: Duration) -> prost_types::Duration {
     // Only durations of more than 2^63 seconds do not fit.
     prost_types::Duration::try_from(duration).unwrap_or_default()
 }

@@ -4,24 +4,27 @@
 //! A session is one task. It has at most one frame in the model's queue; the others wait here (`ALL`) or replace each
 //! other (`LATEST`).
 
+mod dropped;
 mod filter;
 mod policy;
 mod retarget;
 
 use std::{collections::VecDeque, sync::Arc, time::Instant};
 
-use emp_proto::v1::{Delivery, DropReason, DroppedFrame, FrameHeader};
+use emp_proto::v1::{Delivery, DroppedFrame, FrameHeader};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 
-pub(crate) use self::{filter::FilterStream, policy::PolicyStream, retarget::RetargetStream};
+pub(crate) use self::{
+    dropped::NotComputed, filter::FilterStream, policy::PolicyStream, retarget::RetargetStream,
+};
 use crate::{
-    batcher::{Rejected, Ticket},
+    batcher::{Batcher, Rejected, Ticket},
     catalog::{Catalog, Served},
     deadline,
     error::{FieldError, ServiceError},
-    queue::{Answer, JobError, Outcome, Priority},
+    queue::{Answer, Outcome, Priority},
 };
 
 /// What differs between the kinds of streams: their messages, their model, and what they remember from frame to frame.
@@ -112,9 +115,19 @@ pub(crate) async fn run<K: Kind>(
     inbound: Streaming<K::Request>,
     outbound: mpsc::Sender<Response<K>>,
 ) {
+    let conversation = converse::<K>(&context, inbound, &outbound);
+    conclude(context.deadline, &outbound, conversation).await;
+}
+
+/// Brings a stream's conversation to its end, and tells the client why it ended.
+pub(crate) async fn conclude<R>(
+    deadline: Option<Instant>,
+    outbound: &mpsc::Sender<Result<R, Status>>,
+    conversation: impl Future<Output = Result<(), ServiceError>>,
+) {
     let end = tokio::select! {
-        end = converse::<K>(&context, inbound, &outbound) => end,
-        () = deadline::passed(context.deadline) => Err(ServiceError::DeadlineExceeded),
+        end = conversation => end,
+        () = deadline::passed(deadline) => Err(ServiceError::DeadlineExceeded),
         () = outbound.closed() => return tracing::info!("the client left its stream"),
     };
     match end {
@@ -216,9 +229,7 @@ impl<K: Kind> Session<K> {
         let delivery = read_delivery(K::delivery(config))?;
         let model = K::model(&context.catalog, config)?;
         let kind = K::open(config, model)?;
-        if let Some(retry) = model.batcher.overload(Priority::Stream) {
-            return Err(Rejected::Full(retry).into());
-        }
+        check_room(&model.batcher)?;
         tracing::info!(model = model.card.name, ?delivery, "stream started");
         let started = kind.started();
         Ok(Self {
@@ -254,11 +265,12 @@ impl<K: Kind> Session<K> {
             (Ok(frame), Delivery::Latest) => self.accept_latest(frame),
             (Ok(frame), _) => self.waiting.push_back(Waiting::Frame(frame)),
             (Err(error), Delivery::Latest) => {
-                self.outbox.push_back(K::dropped(invalid(header, error)));
+                self.outbox
+                    .push_back(K::dropped(NotComputed::from(error).notice(header)));
             }
             (Err(error), _) => self
                 .waiting
-                .push_back(Waiting::Notice(invalid(header, error))),
+                .push_back(Waiting::Notice(NotComputed::from(error).notice(header))),
         }
         Ok(())
     }
@@ -281,7 +293,7 @@ impl<K: Kind> Session<K> {
     fn accept_latest(&mut self, mut frame: Frame<K::Frame>) {
         if let Some(Waiting::Frame(old)) = self.waiting.pop_front() {
             K::supersede(&old.content, &mut frame.content);
-            self.drop_superseded(old.header);
+            self.drop_frame(old.header, NotComputed::superseded());
         } else if let Some(in_flight) = &mut self.in_flight {
             let input = self.kind.input(&frame.content);
             if self
@@ -292,18 +304,10 @@ impl<K: Kind> Session<K> {
             {
                 let old = std::mem::replace(&mut in_flight.header, frame.header);
                 in_flight.deadline = frame.deadline;
-                return self.drop_superseded(old);
+                return self.drop_frame(old, NotComputed::superseded());
             }
         }
         self.waiting.push_back(Waiting::Frame(frame));
-    }
-
-    fn drop_superseded(&mut self, header: Option<FrameHeader>) {
-        self.drop_frame(
-            header,
-            DropReason::Superseded,
-            "a newer frame took its place",
-        );
     }
 
     /// Sends the next waiting frame to the model, if none is there.
@@ -325,7 +329,7 @@ impl<K: Kind> Session<K> {
         } = frame;
         let input = self.kind.input(&content);
         if deadline::has_passed(deadline) {
-            return self.drop_late(header);
+            return self.drop_frame(header, NotComputed::late());
         }
         match self.model.batcher.submit(Priority::Stream, input, deadline) {
             Ok(ticket) => {
@@ -335,16 +339,7 @@ impl<K: Kind> Session<K> {
                     deadline,
                 });
             }
-            Err(Rejected::Full(_)) => {
-                self.drop_frame(header, DropReason::Overloaded, "the model's queue is full");
-            }
-            Err(Rejected::Unavailable) => {
-                self.drop_frame(
-                    header,
-                    DropReason::ModelUnavailable,
-                    "the model is being rebuilt",
-                );
-            }
+            Err(rejected) => self.drop_frame(header, rejected.into()),
         }
     }
 
@@ -357,40 +352,31 @@ impl<K: Kind> Session<K> {
             return;
         };
         match outcome {
-            Ok(_) if deadline::has_passed(deadline) => self.drop_late(header),
+            Ok(_) if deadline::has_passed(deadline) => self.drop_frame(header, NotComputed::late()),
             Ok(answer) => {
                 let response = self.kind.answer(header, answer);
                 self.outbox.push_back(response);
             }
-            Err(JobError::DeadlineExceeded) => self.drop_late(header),
-            Err(error @ JobError::ModelFailed(_)) => {
-                self.drop_frame(header, DropReason::ModelFailed, &error.to_string());
-            }
-            Err(error @ JobError::ModelUnavailable) => {
-                self.drop_frame(header, DropReason::ModelUnavailable, &error.to_string());
-            }
+            Err(error) => self.drop_frame(header, error.into()),
         }
     }
 
-    fn drop_late(&mut self, header: Option<FrameHeader>) {
-        self.drop_frame(
-            header,
-            DropReason::DeadlineExceeded,
-            "its time budget ran out",
-        );
-    }
-
-    fn drop_frame(&mut self, header: Option<FrameHeader>, reason: DropReason, description: &str) {
-        self.outbox.push_back(K::dropped(DroppedFrame {
-            header,
-            reason: reason.into(),
-            field: String::new(),
-            description: description.to_owned(),
-        }));
+    fn drop_frame(&mut self, header: Option<FrameHeader>, why: NotComputed) {
+        self.outbox.push_back(K::dropped(why.notice(header)));
     }
 }
 
-fn read_delivery(number: i32) -> Result<Delivery, FieldError> {
+/// Refuses a stream while its model has no room.
+pub(crate) fn check_room<I: Send + 'static, O: Send + 'static>(
+    batcher: &Batcher<I, O>,
+) -> Result<(), ServiceError> {
+    match batcher.overload(Priority::Stream) {
+        Some(retry) => Err(Rejected::Full(retry).into()),
+        None => Ok(()),
+    }
+}
+
+pub(crate) fn read_delivery(number: i32) -> Result<Delivery, FieldError> {
     match Delivery::try_from(number) {
         Ok(Delivery::Unspecified | Delivery::All) => Ok(Delivery::All),
         Ok(Delivery::Latest) => Ok(Delivery::Latest),
@@ -398,15 +384,5 @@ fn read_delivery(number: i32) -> Result<Delivery, FieldError> {
             "config.delivery",
             format!("{number}; expected a value of emp.v1.Delivery"),
         )),
-    }
-}
-
-fn invalid(header: Option<FrameHeader>, error: FieldError) -> DroppedFrame {
-    let FieldError { field, description } = error;
-    DroppedFrame {
-        header,
-        reason: DropReason::Invalid.into(),
-        field,
-        description,
     }
 }

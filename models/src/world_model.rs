@@ -1,4 +1,4 @@
-//! The world model f_w: the next state of the robot from the stack `S_t` and the action, differentiable (paper, section V-B).
+//! The world model `f_w`: the next state of the robot from the stack `S_t` and the action, differentiable (paper, section V-B).
 //!
 //! ```text
 //! S_t (15 × 57, goal ĝ_t) ──history map──▶ 4 × 57 ┐

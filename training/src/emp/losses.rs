@@ -331,6 +331,12 @@ mod tests {
         let foot_support = rows(&[[0.0, 0.0], [0.0, 0.0], [0.0, 0.2]]);
         let at = |reference| centroid(&center_of_mass, &foot_support, reference);
         assert_near(at([0.035, 0.0]), &[0.0, 0.14_f64.exp() - 1.0, 9.0]);
+        for distance in [0.03, 0.05, 1.02] {
+            assert_near(
+                centroid(&rows(&[[distance, 0.0]]), &rows(&[[0.0; 2]]), [0.0; 2]),
+                &[centroid_of(distance)],
+            );
+        }
         // E5 as printed, about the centre.
         let distance = 0.035_f64.hypot(0.03);
         let expected = (-7.0 * (0.03 - distance)).exp() - 1.0;

@@ -35,7 +35,7 @@ pub struct Rollout {
     pub goals: Vec<f32>,
     /// What the EMP answered, not held inside the joints' ranges.
     pub means: Vec<f32>,
-    /// What was drawn around it.
+    /// What was drawn around it, without what stays of earlier exploration.
     pub samples: Vec<f32>,
     /// Goals that were asked for two periods ago, and one. At an episode's start: the present one.
     pub goals_before: [Vec<f32>; PAST],
@@ -111,8 +111,42 @@ pub struct Explorer {
     environments: TrackingEnvironments,
     /// Of each goal joint, rad.
     ranges: Vec<[f32; 2]>,
-    noise: Vec<ChaCha8Rng>,
+    noise: Vec<Noise>,
     past: Past,
+}
+
+/// Exploration of one environment: noise that stays for a while.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Noise {
+    rng: ChaCha8Rng,
+    /// What was added to each goal joint in the last control period, rad.
+    lasting: Vec<f32>,
+}
+
+/// How an EMP is explored.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Exploration {
+    /// Standard deviation of what is new in a control period, rad.
+    pub std: f64,
+    /// Share of the noise of one control period that stays in the next.
+    pub persistence: f64,
+}
+
+impl Noise {
+    /// Adds noise to a row of answers: what is new to `sample`, what stays too to `executed`.
+    fn explore(&mut self, exploration: Exploration, sample: &mut [f32], executed: &mut [f32]) {
+        if exploration.std == 0.0 {
+            return;
+        }
+        let rows = sample.iter_mut().zip(executed).zip(&mut self.lasting);
+        for ((sample, executed), lasting) in rows {
+            let normal: f32 = StandardNormal.sample(&mut self.rng);
+            let new = exploration.std as f32 * normal;
+            *lasting = exploration.persistence as f32 * *lasting + new;
+            *sample += new;
+            *executed += *lasting;
+        }
+    }
 }
 
 /// What was asked for and answered two periods ago, and one; N rows each.
@@ -153,13 +187,18 @@ impl Past {
 impl Explorer {
     /// An explorer of `environments`; `seed` is that of the noise.
     pub fn new(environments: TrackingEnvironments, seed: u64) -> Self {
+        let joints = environments.robot().goal_joints();
         let noise = (0..environments.len() as u64).map(|number| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed ^ NOISE);
             rng.set_stream(number);
-            rng
+            Noise {
+                rng,
+                lasting: vec![0.0; joints.len()],
+            }
         });
-        let joints = environments.robot().goal_joints().iter();
-        let ranges = joints.map(|joint| joint.range.map(|limit| limit as f32));
+        let ranges = joints
+            .iter()
+            .map(|joint| joint.range.map(|limit| limit as f32));
         Self {
             ranges: ranges.collect(),
             noise: noise.collect(),
@@ -174,14 +213,14 @@ impl Explorer {
     }
 
     /// Runs the environments for `frames` control periods. Goals are `network`'s answers (without one, those that are asked
-    /// for) plus normal noise of deviation `std`, rad. Forward passes run on `threads`.
+    /// for) plus normal noise. Forward passes run on `threads`.
     ///
     /// # Errors
     /// When the network or the simulation fails.
     pub fn collect(
         &mut self,
         network: Option<&EmpNetwork>,
-        std: f64,
+        exploration: Exploration,
         frames: usize,
         cost: &Cost<'_>,
         threads: &rayon::ThreadPool,
@@ -191,14 +230,14 @@ impl Explorer {
             ..Rollout::default()
         };
         for t in 0..frames {
-            let environments = &self.environments;
-            let goals = environments.goals().to_vec();
-            self.past.start(environments.starts(), &goals);
+            let goals = self.environments.goals().to_vec();
+            self.past.start(self.environments.starts(), &goals);
             let means = match network {
-                Some(network) => answers(network, environments, threads)?,
+                Some(network) => answers(network, &self.environments, threads)?,
                 None => goals.clone(),
             };
-            let samples = explore(&mut self.noise, &means, std);
+            let (samples, executed) = self.explore(exploration, &means);
+            let environments = &self.environments;
             rollout
                 .stacks
                 .extend_from_slice(environments.observations());
@@ -211,7 +250,7 @@ impl Explorer {
                 all.extend_from_slice(past);
             }
             self.past.push(&goals, &means);
-            let step = self.environments.step(&inside(&samples, &self.ranges))?;
+            let step = self.environments.step(&inside(&executed, &self.ranges))?;
             rollout.add(t, &step, cost);
             rollout.goals.extend_from_slice(&goals);
             rollout.means.extend_from_slice(&means);
@@ -221,6 +260,23 @@ impl Explorer {
             .last_privileged
             .extend_from_slice(self.environments.privileged());
         Ok(rollout)
+    }
+
+    /// Answers with what is new in their noise, and with all of it. Noise does not outlast an episode.
+    fn explore(&mut self, exploration: Exploration, means: &[f32]) -> (Vec<f32>, Vec<f32>) {
+        let (mut samples, mut executed) = (means.to_vec(), means.to_vec());
+        let width = self.ranges.len();
+        let rows = samples
+            .chunks_exact_mut(width)
+            .zip(executed.chunks_exact_mut(width));
+        let robots = self.noise.iter_mut().zip(self.environments.starts());
+        for ((sample, executed), (noise, start)) in rows.zip(robots) {
+            if *start {
+                noise.lasting.fill(0.0);
+            }
+            noise.explore(exploration, sample, executed);
+        }
+        (samples, executed)
     }
 
     /// Everything that later rollouts depend on, but for the network.
@@ -297,21 +353,6 @@ fn answers(
         batches.collect::<candle_core::Result<Vec<_>>>()
     })?;
     Ok(answers.concat())
-}
-
-/// Adds noise to rows of means.
-fn explore(noise: &mut [ChaCha8Rng], means: &[f32], std: f64) -> Vec<f32> {
-    let mut samples = means.to_vec();
-    if std > 0.0 {
-        let width = means.len() / noise.len().max(1);
-        for (row, rng) in samples.chunks_exact_mut(width).zip(noise) {
-            for sample in row {
-                let normal: f32 = StandardNormal.sample(rng);
-                *sample += std as f32 * normal;
-            }
-        }
-    }
-    samples
 }
 
 /// Rows of goals, held inside the joints' ranges.

@@ -126,8 +126,11 @@ pub struct RiskSettings {
     pub trace_decay: f64,
     /// The probability ratio is clipped to 1 ± this.
     pub clip: f64,
-    /// Standard deviation of exploration, rad.
+    /// Standard deviation of what is new in exploration in a control period, rad.
     pub std: f64,
+    /// Share of the exploration of one control period that stays in the next; 0: white noise. A fall builds up over a
+    /// second: what lasts shows its effect, what is gone after 20 ms does not.
+    pub persistence: f64,
     /// The step size follows this divergence between the EMP before the update and now.
     pub target_divergence: f64,
     /// Widths of the critic's hidden layers.
@@ -190,7 +193,8 @@ impl Settings {
                 discount: 0.99,
                 trace_decay: 0.95,
                 clip: 0.2,
-                std: 0.05,
+                std: 0.03,
+                persistence: 0.95,
                 target_divergence: 0.01,
                 critic_hidden: vec![256, 128, 64],
                 critic_learning_rate: 1e-3,
@@ -239,7 +243,9 @@ impl Settings {
             },
             horizon: 0,
             risk: RiskSettings {
-                weight: 200.0,
+                weight: 1000.0,
+                orientation: 0.1,
+                contact: 0.005,
                 ..paper.risk.clone()
             },
             optimizer: OptimizerSettings {
@@ -304,6 +310,12 @@ impl Settings {
         }
         if self.risk.weight < 0.0 || self.risk.std <= 0.0 {
             bail!("settings `risk.weight` and `risk.std` must not be negative, nor `risk.std` 0");
+        }
+        if !(0.0..1.0).contains(&self.risk.persistence) {
+            let persistence = self.risk.persistence;
+            bail!(
+                "setting `risk.persistence` is {persistence}, expected 0 or more and less than 1"
+            );
         }
         Ok(())
     }

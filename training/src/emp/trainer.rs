@@ -21,7 +21,7 @@ use super::{
     judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics, WarmUp},
     objective::Terms,
-    rollout::{Cost, CostSums, Explorer},
+    rollout::{Cost, CostSums, Exploration, Explorer},
     settings::Settings,
 };
 use crate::{
@@ -109,7 +109,8 @@ impl Trainer {
             reference: [0.0; 2],
         };
         let threads = &equipment.threads;
-        let rollout = explorer.collect(None, 0.0, settings.warm_up, &cost, threads)?;
+        let unexplored = Exploration::default();
+        let rollout = explorer.collect(None, unexplored, settings.warm_up, &cost, threads)?;
         let layout = *explorer.environments().layout();
         let warm_up = WarmUp::new(rollout, &layout)?;
         Ok(Self {
@@ -233,13 +234,20 @@ impl Trainer {
             settings: risk,
             reference: self.learner.reference(),
         };
-        let std = if risk.weight > 0.0 { risk.std } else { 0.0 };
+        let exploration = if risk.weight > 0.0 {
+            Exploration {
+                std: risk.std,
+                persistence: risk.persistence,
+            }
+        } else {
+            Exploration::default()
+        };
         let threads = &self.equipment.threads;
         let network = self.learner.network().clone();
         let frames = self.settings.frames;
         let rollout = self
             .explorer
-            .collect(Some(&network), std, frames, &cost, threads)?;
+            .collect(Some(&network), exploration, frames, &cost, threads)?;
         let collecting = start.elapsed().as_secs_f64();
         let update = self.learner.update(&rollout, threads)?;
         let rows = rollout.rows();

@@ -100,5 +100,14 @@ const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_
 #[test]
 fn an_emp_that_learns_the_price_of_falls_resumes_bit_for_bit() {
     let arguments = format!("emp --preset default {EMP}");
-    check(&arguments.split(' ').collect::<Vec<_>>(), 20);
+    check(&arguments.split_whitespace().collect::<Vec<_>>(), 20);
+}
+
+#[test]
+fn an_emp_that_imagines_resumes_bit_for_bit() {
+    let sizes = "--set network.state_hidden=[16] --set network.target_hidden=[16] \
+                 --set network.fusion_hidden=[16] --set network.decoder_hidden=[16] \
+                 --set world_model.learner.hidden=[16] --set horizon=2 --set wm_loss_steps=2";
+    let arguments = format!("emp --preset paper {EMP} {sizes}");
+    check(&arguments.split_whitespace().collect::<Vec<_>>(), 20);
 }

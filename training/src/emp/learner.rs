@@ -24,7 +24,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    imagination::ImaginedStep,
+    imagination::{Imagination, ImaginedStep},
     objective::{Moments, Objective},
     rollout::Rollout,
     settings::Settings,
@@ -241,6 +241,7 @@ impl Learner {
     pub fn update(
         &mut self,
         rollout: &Rollout,
+        imagination: Option<&Imagination>,
         threads: &rayon::ThreadPool,
     ) -> Result<UpdateStatistics> {
         let start = Instant::now();
@@ -258,7 +259,7 @@ impl Learner {
             }
             let left = order.len().saturating_sub(optimizer.rows);
             let rows = order.split_off(left);
-            self.step(rollout, &batch, &rows, threads, &mut sums)
+            self.step(rollout, &batch, &rows, imagination, threads, &mut sums)
                 .with_context(|| format!("rollout {}, update {update}", self.progress.updates))?;
         }
         let newest = rollout.privileged.len() - self.critic.moments.width() * rollout.environments;
@@ -333,6 +334,7 @@ impl Learner {
         rollout: &Rollout,
         batch: &Batch,
         rows: &[usize],
+        imagination: Option<&Imagination>,
         threads: &rayon::ThreadPool,
         sums: &mut Sums,
     ) -> Result<()> {
@@ -340,7 +342,7 @@ impl Learner {
         let shards = threads.install(|| {
             let shards = rows.par_chunks(shard_rows);
             shards
-                .map(|shard| self.shard(rollout, batch, shard, rows.len()))
+                .map(|shard| self.shard(rollout, batch, shard, rows.len(), imagination))
                 .collect::<Result<Vec<_>>>()
         })?;
         let risk = &self.settings.risk;
@@ -374,11 +376,17 @@ impl Learner {
         batch: &Batch,
         rows: &[usize],
         total: usize,
+        imagination: Option<&Imagination>,
     ) -> Result<Shard> {
         let share = rows.len() as f64 / total as f64;
         let stacks = gathered(&rollout.stacks, self.layout.width(), rows)?;
         let moments = self.moments(rollout, rows)?;
-        let steps = vec![self.unimagined(&stacks)?];
+        let steps = match imagination {
+            Some(imagination) => {
+                imagination.unroll(&self.network, &stacks, &moments.goals_ahead)?
+            }
+            None => vec![self.unimagined(&stacks)?],
+        };
         let terms = self.objective.terms(&moments, &steps)?;
         let mut loss = (terms.total(&self.settings.losses.weights)? * share)?;
         let (mut surrogate, mut divergence) = (0.0, 0.0);
@@ -633,7 +641,7 @@ fn shrink(vars: &VarMap, layer: &str) -> Result<()> {
 }
 
 /// Rows that are followed by `horizon` − 1 more of the same episode within the rollout.
-fn usable_rows(rollout: &Rollout, horizon: usize) -> Vec<usize> {
+pub(super) fn usable_rows(rollout: &Rollout, horizon: usize) -> Vec<usize> {
     let ahead = horizon.saturating_sub(1);
     let follows = |row: usize| {
         let next = row + ahead * rollout.environments;

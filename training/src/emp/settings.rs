@@ -10,6 +10,7 @@ use emp_sim::tracking::TrackingSettings;
 use serde::{Deserialize, Serialize};
 
 use super::losses::{CenOn, CenRef, LossSettings, LossWeights, SmoothOn};
+use crate::world_model::settings::LearnerSettings;
 
 /// A set of settings with a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -43,6 +44,8 @@ pub struct Settings {
     pub horizon: usize,
     /// Control periods of the world model's loss beyond which it is not followed; 1 is the paper's.
     pub wm_loss_steps: usize,
+    /// How the world model learns, where anything is imagined.
+    pub world_model: WorldModelSettings,
     /// What falls cost, learnt from real rollouts.
     pub risk: RiskSettings,
     /// Steps of the optimiser.
@@ -103,6 +106,20 @@ impl NetworkSettings {
             gate: self.gate,
         }
     }
+}
+
+/// How the world model learns beside the EMP.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorldModelSettings {
+    /// Mini-batches after each rollout.
+    pub updates: usize,
+    /// Rows of a mini-batch.
+    pub rows: usize,
+    /// Step size.
+    pub learning_rate: f64,
+    /// Its network.
+    pub learner: LearnerSettings,
 }
 
 /// The price of falls and of what leads to them. One imagined period cannot see a fall that builds up over a second, and the
@@ -185,6 +202,12 @@ impl Settings {
             losses: LossSettings::default(),
             horizon: 1,
             wm_loss_steps: 1,
+            world_model: WorldModelSettings {
+                updates: 8,
+                rows: 256,
+                learning_rate: 5e-4,
+                learner: LearnerSettings::default(),
+            },
             risk: RiskSettings {
                 weight: 0.0,
                 orientation: 0.05,
@@ -287,6 +310,13 @@ impl Settings {
             ("environments", self.environments),
             ("frames", self.frames),
             ("warm_up", self.warm_up),
+            ("wm_loss_steps", self.wm_loss_steps),
+            ("world_model.updates", self.world_model.updates),
+            ("world_model.rows", self.world_model.rows),
+            (
+                "world_model.learner.shards",
+                self.world_model.learner.shards,
+            ),
             ("optimizer.updates", self.optimizer.updates),
             ("optimizer.rows", self.optimizer.rows),
             ("optimizer.shards", self.optimizer.shards),
@@ -295,12 +325,14 @@ impl Settings {
         if let Some((name, _)) = counts.iter().find(|(_, count)| *count == 0) {
             bail!("setting `{name}` is 0, expected at least 1");
         }
-        if self.horizon >= self.frames {
-            bail!(
-                "setting `horizon` is {}, expected less than `frames`, {}",
-                self.horizon,
-                self.frames
-            );
+        for (name, steps) in [
+            ("horizon", self.horizon),
+            ("wm_loss_steps", self.wm_loss_steps),
+        ] {
+            if steps > self.frames {
+                let frames = self.frames;
+                bail!("setting `{name}` is {steps}, expected at most `frames`, {frames}");
+            }
         }
         if !(0.0..=1.0).contains(&self.live) {
             bail!(

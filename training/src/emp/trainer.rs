@@ -18,6 +18,7 @@ use emp_sim::{Pool, goals::GoalClip, tracking::TrackingEnvironments};
 use serde::{Deserialize, Serialize};
 
 use super::{
+    imaginer::Imaginer,
     judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics, WarmUp},
     objective::Terms,
@@ -33,11 +34,13 @@ use emp_models::policy::Policy;
 /// Kind of the checkpoints in a run's folder, which hold the critic, the optimisers and the environments too.
 const RUN_KIND: &str = "emp-run";
 
-/// The environments' snapshot in a checkpoint.
+/// Snapshots in a checkpoint: of the EMP's environments, and of the world model's.
 const ENVIRONMENTS: &str = "environments";
+const IMAGINED_ENVIRONMENTS: &str = "environments.world-model";
 
 /// Columns of the log after the step and the losses.
-const COLUMNS: [&str; 13] = [
+const COLUMNS: [&str; 14] = [
+    "world_model",
     "risk",
     "falls",
     "tilt",
@@ -74,7 +77,9 @@ pub struct Trainer {
     settings: Settings,
     explorer: Explorer,
     learner: Learner,
-    /// Environment steps learnt from.
+    /// The world model, where anything is imagined.
+    imaginer: Option<Imaginer>,
+    /// Environment steps of the EMP learnt from.
     steps: u64,
 }
 
@@ -84,6 +89,8 @@ struct Saved {
     settings: Settings,
     steps: u64,
     learner: learner::Progress,
+    /// Rollouts and optimiser steps of the world model.
+    imaginer: Option<[u64; 2]>,
 }
 
 /// A run's files and its judge.
@@ -103,7 +110,8 @@ impl Trainer {
     /// When a setting is out of bounds, or the robot falls whatever it is asked for.
     pub fn new(equipment: Equipment, settings: Settings) -> Result<Self> {
         settings.check()?;
-        let mut explorer = Explorer::new(environments(&equipment, &settings)?, settings.seed);
+        let seed = settings.seed;
+        let mut explorer = Explorer::new(environments(&equipment, &settings, seed)?, seed);
         let cost = Cost {
             settings: &settings.risk,
             reference: [0.0; 2],
@@ -115,6 +123,10 @@ impl Trainer {
         let warm_up = WarmUp::new(rollout, &layout)?;
         Ok(Self {
             learner: Learner::new(&equipment.robot, &settings, &warm_up)?,
+            imaginer: match settings.horizon {
+                0 => None,
+                _ => Some(Imaginer::new(&equipment, &settings)?),
+            },
             explorer,
             equipment,
             settings,
@@ -137,13 +149,23 @@ impl Trainer {
             path.display(),
             saved.settings
         );
-        let environments = tensors
-            .remove(ENVIRONMENTS)
-            .with_context(|| format!("{}: no tensor `{ENVIRONMENTS}`", path.display()))?;
+        let mut snapshot = |name: &str| {
+            let snapshot = tensors
+                .remove(name)
+                .with_context(|| format!("{}: no tensor `{name}`", path.display()))?;
+            Ok::<_, anyhow::Error>(snapshot.to_vec1::<u8>()?)
+        };
+        let environments = snapshot(ENVIRONMENTS)?;
         let mut trainer = Self::new(equipment, settings)?;
+        if let (Some(imaginer), Some(counts)) = (&mut trainer.imaginer, saved.imaginer) {
+            let environments = snapshot(IMAGINED_ENVIRONMENTS)?;
+            imaginer
+                .restore(&tensors, &environments, counts)
+                .with_context(|| path.display().to_string())?;
+        }
         trainer
             .explorer
-            .restore(&environments.to_vec1::<u8>()?)
+            .restore(&environments)
             .with_context(|| path.display().to_string())?;
         trainer
             .learner
@@ -209,18 +231,25 @@ impl Trainer {
     /// When the file cannot be written.
     pub fn save_run(&self, path: &Path) -> Result<()> {
         let mut tensors = self.learner.state()?;
-        let environments = self.explorer.snapshot()?;
-        let bytes = environments.len();
-        tensors.insert(
-            ENVIRONMENTS.to_owned(),
-            Tensor::from_vec(environments, bytes, &Device::Cpu)?,
-        );
+        let mut snapshots = vec![(ENVIRONMENTS, self.explorer.snapshot()?)];
+        let mut counts = None;
+        if let Some(imaginer) = &self.imaginer {
+            let (environments, imaginers) = imaginer.save(&mut tensors)?;
+            snapshots.push((IMAGINED_ENVIRONMENTS, environments));
+            counts = Some(imaginers);
+        }
+        for (name, snapshot) in snapshots {
+            let bytes = snapshot.len();
+            let snapshot = Tensor::from_vec(snapshot, bytes, &Device::Cpu)?;
+            tensors.insert(name.to_owned(), snapshot);
+        }
         let mut metadata = run_metadata(&self.equipment.robot);
         metadata.config = serde_json::to_value(self.learner.network().config())?;
         metadata.training = serde_json::to_value(Saved {
             settings: self.settings.clone(),
             steps: self.steps,
             learner: self.learner.progress(),
+            imaginer: counts,
         })?;
         checkpoint::save(path, metadata, &tensors)?;
         Ok(())
@@ -228,6 +257,11 @@ impl Trainer {
 
     /// Collects a rollout and learns from it.
     fn step(&mut self) -> Result<Step> {
+        let (mut world_model, mut imagination) = (f64::NAN, None);
+        if let Some(imaginer) = &mut self.imaginer {
+            world_model = imaginer.learn(&self.equipment)?;
+            imagination = Some(imaginer.imagination(&self.equipment)?);
+        }
         let start = Instant::now();
         let risk = &self.settings.risk;
         let cost = Cost {
@@ -249,7 +283,9 @@ impl Trainer {
             .explorer
             .collect(Some(&network), exploration, frames, &cost, threads)?;
         let collecting = start.elapsed().as_secs_f64();
-        let update = self.learner.update(&rollout, threads)?;
+        let update = self
+            .learner
+            .update(&rollout, imagination.as_ref(), threads)?;
         let rows = rollout.rows();
         self.steps += rows as u64;
         let changes = rollout.means.iter().zip(&rollout.goals);
@@ -258,6 +294,7 @@ impl Trainer {
             change: change / rollout.means.len() as f64,
             sums: rollout.sums,
             episodes: rollout.episodes(),
+            world_model,
             rows,
             update,
             collecting,
@@ -267,6 +304,8 @@ impl Trainer {
 
 /// What one rollout and its update measured.
 struct Step {
+    /// Loss of the world model; not a number without one.
+    world_model: f64,
     sums: CostSums,
     /// Mean absolute change of a goal angle, rad.
     change: f64,
@@ -281,6 +320,7 @@ impl Step {
         let (sums, update, rows) = (&self.sums, &self.update, self.rows as f64);
         let mut row = update.terms.to_vec();
         row.extend([
+            self.world_model,
             update.risk,
             sums.falls,
             sums.orientation / rows,
@@ -355,7 +395,12 @@ pub fn train(
     Ok(Outcome::Finished)
 }
 
-fn environments(equipment: &Equipment, settings: &Settings) -> Result<TrackingEnvironments> {
+/// Environments whose episodes follow from `seed`.
+pub(super) fn environments(
+    equipment: &Equipment,
+    settings: &Settings,
+    seed: u64,
+) -> Result<TrackingEnvironments> {
     Ok(TrackingEnvironments::new(
         Arc::clone(&equipment.robot),
         Arc::clone(&equipment.pool),
@@ -363,7 +408,7 @@ fn environments(equipment: &Equipment, settings: &Settings) -> Result<TrackingEn
         settings.episodes,
         Arc::clone(&equipment.clips),
         0..settings.environments as u64,
-        settings.seed,
+        seed,
     )?)
 }
 

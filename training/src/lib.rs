@@ -10,3 +10,4 @@ pub mod retargeter;
 mod rows;
 pub mod run;
 pub mod variables;
+pub mod world_model;

@@ -1,0 +1,210 @@
+//! `emp-train world-model` and `emp-train world-model-report`.
+
+use std::{
+    path::{Path, PathBuf},
+    process::ExitCode,
+    sync::Arc,
+    time::Duration,
+};
+
+use anyhow::{Context as _, Result, ensure};
+use clap::Args;
+use emp_models::{policy::Policy, retarget::Retargeter, world_model::WorldModel};
+use emp_robot::Robot;
+use emp_sim::{
+    Pool, Priority,
+    tracking::{TrackingEnvironments, TrackingSettings},
+};
+use emp_training::{
+    emp::data::{self, Motions},
+    run::{Interrupt, Outcome, RunFiles},
+    world_model::{
+        accuracy,
+        settings::Settings,
+        trainer::{self, Equipment, Trainer},
+    },
+};
+
+use crate::{
+    RobotArguments, policy_weights, retargeter_weights,
+    trial::{TrialArguments, printed},
+};
+
+/// What is trained, and on what.
+#[derive(Args)]
+pub(crate) struct Arguments {
+    #[command(flatten)]
+    robot: RobotArguments,
+    /// Folders (or files) of recorded motion: .bvh, AMASS .npz, key-node .npz.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    motions: Vec<PathBuf>,
+    /// The policy that moves the legs [default: models/weights/ROBOT-policy.safetensors].
+    #[arg(long, value_name = "FILE")]
+    policy: Option<PathBuf>,
+    /// Weights of the retargeter [default: models/weights/ROBOT-retargeter.safetensors].
+    #[arg(long, value_name = "FILE")]
+    retargeter: Option<PathBuf>,
+    /// Where the model goes [default: model.safetensors in the run's folder].
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Steps of the optimiser.
+    #[arg(long, default_value_t = Settings::default().steps)]
+    steps: u64,
+    /// Control periods that the loss predicts one after the other; 1 is the paper's.
+    #[arg(long, default_value_t = Settings::default().wm_loss_steps)]
+    loss_steps: usize,
+    /// Sequences in a batch.
+    #[arg(long, default_value_t = Settings::default().rows)]
+    rows: usize,
+    /// Environments stepped side by side.
+    #[arg(long, default_value_t = Settings::default().environments)]
+    environments: usize,
+    /// Procedural motions in the mix.
+    #[arg(long, default_value_t = Settings::default().procedural_clips)]
+    procedural_clips: usize,
+    /// Seed of weights, episodes and procedural skills.
+    #[arg(long, default_value_t = Settings::default().seed)]
+    seed: u64,
+    /// Continue the run from its checkpoint.
+    #[arg(long)]
+    resume: bool,
+    /// Folder of the run's checkpoint and log [default: runs/world-model-ROBOT].
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+    /// Seconds between two checkpoints.
+    #[arg(long, default_value_t = 120)]
+    save_every: u64,
+    /// Threads for physics and learning; the weights do not depend on it.
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+}
+
+/// Trains a world model.
+pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
+    let robot = arguments.robot.load()?;
+    let folder = arguments.run.clone().unwrap_or_else(|| run_folder(&robot));
+    let files = RunFiles {
+        weights: arguments.out.clone().unwrap_or_else(|| model_file(&folder)),
+        folder,
+        save_every: Duration::from_secs(arguments.save_every),
+    };
+    let checkpoint = files.checkpoint();
+    ensure!(
+        arguments.resume || !checkpoint.exists(),
+        "{} exists: continue with --resume, or remove it, or name another --run",
+        checkpoint.display()
+    );
+    let settings = settings(arguments);
+    settings.check()?;
+    let (equipment, data) = equipment(arguments, robot, &settings)?;
+    let mut trainer = if arguments.resume {
+        Trainer::resume(equipment, settings, &checkpoint)?
+    } else {
+        Trainer::new(equipment, settings)?
+    };
+    let interrupt = Interrupt::listen()?;
+    match trainer::train(&mut trainer, &data, &files, &interrupt)? {
+        Outcome::Finished => {
+            eprintln!("wrote {}", files.weights.display());
+            Ok(ExitCode::SUCCESS)
+        }
+        Outcome::Interrupted => {
+            let steps = trainer.steps();
+            eprintln!("interrupted at step {steps}; continue with --resume");
+            Ok(ExitCode::from(3))
+        }
+    }
+}
+
+fn settings(arguments: &Arguments) -> Settings {
+    Settings {
+        seed: arguments.seed,
+        steps: arguments.steps,
+        environments: arguments.environments,
+        rows: arguments.rows,
+        wm_loss_steps: arguments.loss_steps,
+        procedural_clips: arguments.procedural_clips,
+        ..Settings::default()
+    }
+}
+
+fn equipment(
+    arguments: &Arguments,
+    robot: Arc<Robot>,
+    settings: &Settings,
+) -> Result<(Equipment, serde_json::Value)> {
+    let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
+    let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
+    let weights = policy_weights(arguments.policy.as_ref(), &robot);
+    let motions = Motions {
+        folders: &arguments.motions,
+        procedural: settings.procedural_clips,
+        seed: settings.seed,
+        live: settings.live,
+    };
+    let (clips, data) = data::clips(&retargeter, &motions, arguments.threads)?;
+    eprintln!("{} clips", clips.len());
+    let equipment = Equipment {
+        policy: Arc::new(Policy::load(&weights, Arc::clone(&robot))?),
+        pool: Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?),
+        clips: clips.into(),
+        threads: threads(arguments.threads)?,
+        robot,
+    };
+    Ok((equipment, data))
+}
+
+/// What is measured, and on what.
+#[derive(Args)]
+pub(crate) struct ReportArguments {
+    #[command(flatten)]
+    robot: RobotArguments,
+    #[command(flatten)]
+    trial: TrialArguments,
+    /// The world model [default: runs/world-model-ROBOT/model.safetensors].
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Environments stepped side by side.
+    #[arg(long, default_value_t = 256)]
+    environments: u64,
+    /// Control periods of each.
+    #[arg(long, default_value_t = 400)]
+    frames: usize,
+    /// Print JSON instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Measures a world model and prints the result.
+pub(crate) fn report(arguments: &ReportArguments) -> Result<ExitCode> {
+    let (robot, trial) = (arguments.robot.load()?, &arguments.trial);
+    let file = arguments.model.clone();
+    let file = file.unwrap_or_else(|| model_file(&run_folder(&robot)));
+    let model = WorldModel::load(&file, &robot)?;
+    let mut environments = TrackingEnvironments::new(
+        Arc::clone(&robot),
+        Arc::new(trial.pool(&robot)?),
+        trial.policy(&robot)?,
+        TrackingSettings::default(),
+        trial.clips(&robot)?.into(),
+        0..arguments.environments,
+        trial.seed,
+    )?;
+    let threads = threads(trial.threads)?;
+    let accuracy = accuracy::measure(&model, &mut environments, arguments.frames, &threads)?;
+    print!("{}", printed(&accuracy, arguments.json)?);
+    Ok(ExitCode::SUCCESS)
+}
+
+fn run_folder(robot: &Robot) -> PathBuf {
+    PathBuf::from(format!("runs/world-model-{}", robot.name()))
+}
+
+fn model_file(folder: &Path) -> PathBuf {
+    folder.join("model.safetensors")
+}
+
+fn threads(count: usize) -> Result<rayon::ThreadPool> {
+    let threads = rayon::ThreadPoolBuilder::new().num_threads(count);
+    threads.build().context("starting the learner's threads")
+}

@@ -8,6 +8,9 @@ use tonic_types::StatusExt as _;
 
 use crate::ClientError;
 
+/// The server's reason when somebody holds the place in a session that was asked for.
+const SEAT_TAKEN: &str = "SEAT_TAKEN";
+
 /// Exponential backoff with full jitter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Backoff {
@@ -65,6 +68,16 @@ impl Break {
             }
             _ => false,
         }
+    }
+
+    /// Whether it may succeed after a connection was lost: the server may not have noticed yet, and keep the place in a session
+    /// for whoever held it.
+    pub(crate) fn is_worth_retrying_again(&self) -> bool {
+        let is_taken = |status: &Status| {
+            let info = status.get_details_error_info();
+            info.is_some_and(|info| info.reason == SEAT_TAKEN)
+        };
+        self.is_worth_retrying() || matches!(self, Self::Status(status) if is_taken(status))
     }
 
     /// What happened, in words.
@@ -140,6 +153,10 @@ mod tests {
             info
         )));
         assert!(!retried(Status::invalid_argument("robot")));
+        let taken = ErrorDetails::with_error_info(SEAT_TAKEN, "emp.v1", HashMap::new());
+        let taken = Status::with_error_details(Code::AlreadyExists, "robot", taken);
+        assert!(Break::from(taken.clone()).is_worth_retrying_again());
+        assert!(!retried(taken));
         assert!(retried(Status::unknown("h2 protocol error")));
         assert!(retried(Status::unavailable("draining")));
         assert!(Break::Silence("no answer").is_worth_retrying());

@@ -4,7 +4,8 @@ use std::{path::PathBuf, str::FromStr};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-/// Sends recorded human motion to an emp-server and writes the robot's joint targets, or has a controller evaluated there.
+/// Sends recorded human motion to an emp-server: for a robot's joint targets, to drive a robot in a session, or to have a
+/// controller evaluated there.
 ///
 /// Start a server with `emp-server`; it prints the address that it listens on. Then, for example:
 ///
@@ -13,6 +14,8 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 ///   emp retarget walk.bvh --robot emp27 --realtime --out joints.csv
 ///   emp evaluate --robot emp27 --motions recordings/ --procedural 100 --csv episodes.csv
 ///   emp evaluate --robot emp27 --motions recordings/ --controller emp --amplitude 1.5
+///   emp operate walk.bvh --robot emp27 --session lab
+///   emp observe --robot emp27 --session lab
 ///
 /// Exit codes: 0 done; 1 failed (whatever was received is written); 2 wrong usage; 3 done, but frames are missing though
 /// every frame was asked for; 130 interrupted (Ctrl-C; whatever was received is written).
@@ -57,6 +60,17 @@ pub(crate) enum Command {
     ///
     /// After Ctrl-C, or when the server is lost, what finished is reported and written.
     Evaluate(Evaluate),
+    /// Send a motion file as the operator of a teleoperation session
+    ///
+    /// The motion is resampled to the robot's control rate and sent in real time, refined and smoothed on the server. Who comes
+    /// and goes is said on standard error; at the end it is printed what the session's robot executed meanwhile.
+    Operate(Operate),
+    /// Print what the robot of a teleoperation session executes, a line a control period
+    ///
+    /// The age of the person's pose, the EMP's mode, what the guard does with the goal, the joint whose goal was changed most
+    /// before it is executed, danger, how far the centre of mass is inside the feet's support, and the smallest distance between
+    /// links. With --json everything. It goes on until Ctrl-C.
+    Observe(Observe),
     /// List the robots that the server serves
     Robots,
     /// List the models that the server serves
@@ -84,6 +98,57 @@ pub(crate) struct Retarget {
     /// Smooth the joint angles over time, at the cost of at most one frame of delay
     #[arg(long)]
     pub(crate) smooth: bool,
+}
+
+/// What to send, and to which session.
+#[derive(Args)]
+pub(crate) struct Operate {
+    /// Motion file: BVH (.bvh), AMASS (.npz) or key nodes (.npz)
+    pub(crate) file: PathBuf,
+    /// Name of the robot, as `emp robots` lists it
+    #[arg(long, value_name = "NAME")]
+    pub(crate) robot: String,
+    /// Name of the session
+    #[arg(long, value_name = "NAME")]
+    pub(crate) session: String,
+    /// When the robot's Executable Motion Prior changes goals [default: as the session has it]
+    #[arg(long, value_enum)]
+    pub(crate) emp_mode: Option<EmpMode>,
+}
+
+/// Which session to listen to.
+#[derive(Args)]
+pub(crate) struct Observe {
+    /// Name of the session
+    #[arg(long, value_name = "NAME")]
+    pub(crate) session: String,
+    /// Name of the session's robot
+    #[arg(long, value_name = "NAME")]
+    pub(crate) robot: String,
+    /// Stop after this time [default: never]
+    #[arg(long, value_name = "S")]
+    pub(crate) seconds: Option<f64>,
+}
+
+/// When an Executable Motion Prior changes goals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum EmpMode {
+    /// Never.
+    Off,
+    /// In every control period.
+    On,
+    /// While there is danger.
+    WhenDanger,
+}
+
+impl From<EmpMode> for emp_client::EmpMode {
+    fn from(mode: EmpMode) -> Self {
+        match mode {
+            EmpMode::Off => Self::Off,
+            EmpMode::On => Self::On,
+            EmpMode::WhenDanger => Self::WhenDanger,
+        }
+    }
 }
 
 /// What to evaluate, and how.

@@ -5,16 +5,23 @@ use std::time::{Duration, Instant};
 use emp_motion::{Clip, KeyNodeFrame};
 use emp_proto::v1::{
     CollectRolloutsConfig, EvaluateConfig, FilterGoalRequest, GetModelRequest, GetRobotRequest,
-    GoalClip, ListModelsRequest, Model, RetargetRequest, Robot,
+    GoalClip, ListModelsRequest, Model, RetargetRequest, Robot, TeleoperationRole,
     model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
 };
 use tonic::transport::{Channel, Endpoint};
 
 use crate::{
     Answer, Backoff, ClientError, Collection, Evaluation, FilterAnswer, FilterConfig, FrameSender,
-    GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, RobotFrame, StreamConfig, StreamEvents,
-    driver, wire,
+    GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, PoseSender, RobotFrame, SessionEvents,
+    StreamConfig, StreamEvents, TeleoperationAnswer, TeleoperationConfig, TeleoperationFrame,
+    driver, listener, teleoperation::RobotEnd, wire,
 };
+
+/// Both ends of a stream with a robot at its end.
+type TeleoperationStream = (
+    FrameSender<TeleoperationFrame>,
+    StreamEvents<TeleoperationAnswer>,
+);
 
 /// How long a connection may take to stand.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
@@ -195,6 +202,61 @@ impl Client {
         config: PolicyConfig,
     ) -> Result<(FrameSender<RobotFrame>, StreamEvents<PolicyAnswer>), ClientError> {
         driver::start(self.motion_service(), config, self.backoff).await
+    }
+
+    /// Opens a teleoperation session and holds both its ends: poses and robot states in, the whole path's answers out. Observers
+    /// may join by its name.
+    ///
+    /// A lost connection is restored as that of [`Self::policy_stream`]; the session then begins anew with the config's mode of
+    /// the EMP, unless someone else kept it open.
+    ///
+    /// # Errors
+    /// When the server refuses the stream.
+    pub async fn teleoperate(
+        &self,
+        config: TeleoperationConfig,
+    ) -> Result<TeleoperationStream, ClientError> {
+        let role = TeleoperationRole::Both;
+        let end = RobotEnd { config, role };
+        driver::start(self.motion_service(), end, self.backoff).await
+    }
+
+    /// Joins a teleoperation session as its robot: states in, one a control period, the whole path's answers out. The poses are
+    /// the operator's.
+    ///
+    /// # Errors
+    /// When the server refuses the stream, with `ALREADY_EXISTS` where the session has its robot.
+    pub async fn join_as_robot(
+        &self,
+        config: TeleoperationConfig,
+    ) -> Result<TeleoperationStream, ClientError> {
+        let role = TeleoperationRole::Robot;
+        let end = RobotEnd { config, role };
+        driver::start(self.motion_service(), end, self.backoff).await
+    }
+
+    /// Joins a teleoperation session as its operator: poses in, what the robot executes out. A lost connection is restored with
+    /// backoff; poses that are sent meanwhile are lost.
+    ///
+    /// # Errors
+    /// When the server refuses the stream, with `ALREADY_EXISTS` where the session has its operator.
+    pub async fn operate(
+        &self,
+        config: TeleoperationConfig,
+    ) -> Result<(PoseSender, SessionEvents), ClientError> {
+        let role = TeleoperationRole::Operator;
+        listener::start(self.motion_service(), config, role, self.backoff).await
+    }
+
+    /// Listens to a teleoperation session. A lost connection is restored with backoff.
+    ///
+    /// # Errors
+    /// When the server refuses the stream.
+    pub async fn observe(&self, config: TeleoperationConfig) -> Result<SessionEvents, ClientError> {
+        let role = TeleoperationRole::Observer;
+        let (_, events) =
+            listener::start(self.motion_service(), config, role, self.backoff).await?;
+        Ok(events)
     }
 
     /// Has a controller evaluated on recorded motions, beside the procedural ones of the config.

@@ -281,7 +281,7 @@ impl<K: Kind> Driver<K> {
                         Err(End::Abandoned)
                     };
                 }
-                Err(end) if end.is_worth_retrying() => last = end,
+                Err(end) if end.is_worth_retrying_again() => last = end,
                 Err(end) => return Err(End::Broken(end)),
             }
         }

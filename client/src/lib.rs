@@ -34,9 +34,11 @@ mod client;
 mod driver;
 mod error;
 mod kind;
+mod listener;
 mod rollouts;
 mod statistics;
 mod stream;
+mod teleoperation;
 mod wire;
 
 pub use backoff::Backoff;
@@ -45,9 +47,10 @@ pub use emp_proto::v1::{
     ChangeReason, ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig,
     CollectStarted, Delivery, DropReason, EmpMode, EpisodeEnd, EpisodeFinished, EpisodeMetrics,
     EpisodeResult, EvaluateConfig, EvaluationMetrics, EvaluationResult, EvaluationStarted,
-    FilterResult, GoalClip, GoalStatistics, Joint, KeyNode, MassRange, Metric, Model,
-    ProceduralClips, Push, Randomization, Robot, RolloutBlock, Spread, StepEnd, TrainingEnd,
-    evaluate_response::Message as EvaluationEvent,
+    FilterResult, GoalClip, GoalPhase, GoalStatistics, GuardReport, Joint, KeyNode, MassRange,
+    Metric, Model, PoseReport, ProceduralClips, Push, RampCause, Randomization, Robot,
+    RolloutBlock, Spread, StepEnd, TeleoperatedFrame, TeleoperationPresence, TeleoperationStarted,
+    TrainingEnd, evaluate_response::Message as EvaluationEvent,
 };
 pub use error::ClientError;
 pub use rollouts::{Collection, Evaluation};
@@ -58,4 +61,8 @@ pub use stream::{
     Answer, AnswerTimes, DropCause, Dropped, Event, FilterAnswer, FilterConfig, FrameSender,
     GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, RobotFrame, StreamClosed, StreamConfig,
     StreamEvents,
+};
+pub use teleoperation::{
+    PoseSender, SessionEvent, SessionEvents, TeleoperationAnswer, TeleoperationConfig,
+    TeleoperationFrame,
 };

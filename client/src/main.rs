@@ -6,6 +6,7 @@ mod cli;
 mod evaluate;
 mod report;
 mod retarget;
+mod session;
 
 use std::process::ExitCode;
 
@@ -42,6 +43,8 @@ async fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     match arguments.command {
         Command::Retarget(command) => retarget::run(&client, &command, arguments.json).await,
         Command::Evaluate(command) => evaluate::run(&client, &command, arguments.json).await,
+        Command::Operate(command) => session::operate(&client, &command, arguments.json).await,
+        Command::Observe(command) => session::observe(&client, &command, arguments.json).await,
         Command::Robots => report::robots(&client, arguments.json).await,
         Command::Models => report::models(&client, arguments.json).await,
     }

@@ -83,7 +83,7 @@ pub(crate) fn observation(frame: &GoalFrame) -> v1::PolicyObservation {
     }
 }
 
-fn state(joint_positions: &[f32], orientation: &UnitQuaternion<f64>) -> v1::RobotState {
+pub(crate) fn state(joint_positions: &[f32], orientation: &UnitQuaternion<f64>) -> v1::RobotState {
     v1::RobotState {
         joint_positions: joint_positions.to_vec(),
         base_orientation: Some(quaternion(&orientation.cast())),

@@ -1,0 +1,266 @@
+//! `emp operate` and `emp observe`: a recorded motion as the operator of a session, and an ear to what a session executes.
+
+use std::{collections::BTreeMap, process::ExitCode, time::Duration};
+
+use anyhow::Context as _;
+use emp_client::{
+    Client, ClientError, EmpMode, GoalPhase, GuardReport, PoseSender, SessionEvent, SessionEvents,
+    TeleoperatedFrame, TeleoperationConfig, TeleoperationPresence,
+};
+use emp_motion::Clip;
+use serde_json::{Value, json};
+use tokio::time::{Instant, MissedTickBehavior};
+
+use crate::cli::{Observe, Operate};
+
+const INTERRUPTED: u8 = 130;
+
+/// Sends a motion file as a session's operator, in real time.
+pub(crate) async fn operate(
+    client: &Client,
+    command: &Operate,
+    as_json: bool,
+) -> anyhow::Result<ExitCode> {
+    let file = command.file.clone();
+    // Large recordings take seconds to parse.
+    let clip = tokio::task::spawn_blocking(move || emp_motion::load(&file)).await??;
+    let rate = client.robot(&command.robot).await?.control_rate;
+    let config = TeleoperationConfig {
+        emp_mode: command.emp_mode.map_or(EmpMode::Unspecified, EmpMode::from),
+        ..TeleoperationConfig::new(&command.robot, &command.session)
+    };
+    let (sender, mut events) = client.operate(config).await?;
+    say_who_is_there(&events.started().presence.unwrap_or_default());
+    tokio::spawn(send(clip.resampled(rate), sender, rate));
+    let mut summary = Summary::default();
+    let end = listen(&mut events, |result| summary.add(result)).await;
+    if as_json {
+        println!("{}", summary.json());
+    } else {
+        summary.print();
+    }
+    end
+}
+
+/// Prints what a session executes, until Ctrl-C.
+pub(crate) async fn observe(
+    client: &Client,
+    command: &Observe,
+    as_json: bool,
+) -> anyhow::Result<ExitCode> {
+    let config = TeleoperationConfig::new(&command.robot, &command.session);
+    let mut events = client.observe(config).await?;
+    say_who_is_there(&events.started().presence.unwrap_or_default());
+    let joints = events.started().goal_joint_names.clone();
+    if !as_json {
+        println!("{HEADINGS}");
+    }
+    let listening = listen(&mut events, |result| {
+        if as_json {
+            println!("{}", json_line(result));
+        } else {
+            println!("{}", line(result, &joints));
+        }
+    });
+    match command.seconds {
+        None => listening.await,
+        Some(seconds) => {
+            let time = Duration::try_from_secs_f64(seconds).context("--seconds")?;
+            match tokio::time::timeout(time, listening).await {
+                Ok(end) => end,
+                Err(_) => Ok(ExitCode::SUCCESS),
+            }
+        }
+    }
+}
+
+/// Sends every pose at its time. The receiving end says why a stream ended.
+async fn send(clip: Clip, mut sender: PoseSender, rate: f64) {
+    let mut ticks = tokio::time::interval_at(Instant::now(), Duration::from_secs_f64(1.0 / rate));
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    for pose in &clip.frames {
+        ticks.tick().await;
+        if sender.send(pose, EmpMode::Unspecified).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Listens to the stream's end or to Ctrl-C.
+async fn listen(
+    events: &mut SessionEvents,
+    mut executed: impl FnMut(&TeleoperatedFrame),
+) -> anyhow::Result<ExitCode> {
+    let interrupt = tokio::signal::ctrl_c();
+    tokio::pin!(interrupt);
+    loop {
+        let event = tokio::select! {
+            event = events.next() => event,
+            _ = &mut interrupt => return Ok(ExitCode::from(INTERRUPTED)),
+        };
+        match event {
+            Ok(Some(SessionEvent::Executed(result))) => executed(&result),
+            Ok(Some(event)) => say(&event),
+            Ok(None) => return Ok(ExitCode::SUCCESS),
+            Err(error) => return Err(ClientError::into(error)),
+        }
+    }
+}
+
+fn say(event: &SessionEvent) {
+    match event {
+        SessionEvent::Executed(_) => {}
+        SessionEvent::Presence(presence) => say_who_is_there(presence),
+        SessionEvent::Dropped(dropped) => eprintln!(
+            "emp: pose {} is not used: {} {}",
+            dropped.sequence_number, dropped.field, dropped.description
+        ),
+        SessionEvent::ConnectionLost {
+            reason,
+            attempt,
+            retry_in,
+        } => eprintln!(
+            "emp: connection lost ({reason}); attempt {attempt} in {} ms",
+            retry_in.as_millis()
+        ),
+        SessionEvent::Reconnected => eprintln!("emp: reconnected"),
+    }
+}
+
+fn say_who_is_there(presence: &TeleoperationPresence) {
+    let there = |is_there| if is_there { "there" } else { "away" };
+    eprintln!(
+        "emp: robot {}, operator {}, {} observers",
+        there(presence.robot),
+        there(presence.operator),
+        presence.observers
+    );
+}
+
+const HEADINGS: &str = "frame     pose_ms  emp          goal                  change_rad  joint                  danger  \
+                        com_m    links_m";
+
+/// A name of an enumeration without its prefix, in lower case.
+fn short(name: &str, prefix: &str) -> String {
+    name.strip_prefix(prefix).unwrap_or(name).to_lowercase()
+}
+
+fn phase(result: &TeleoperatedFrame) -> GoalPhase {
+    let guard = result.guard.as_ref();
+    guard.map_or(GoalPhase::Unspecified, GuardReport::phase)
+}
+
+fn phase_name(result: &TeleoperatedFrame) -> String {
+    short(phase(result).as_str_name(), "GOAL_PHASE_")
+}
+
+fn pose_age_ms(result: &TeleoperatedFrame) -> Option<f64> {
+    let age = result.pose.as_ref()?.age?;
+    Duration::try_from(age)
+        .ok()
+        .map(|age| age.as_secs_f64() * 1e3)
+}
+
+/// The joint whose goal was changed most, by index, and by how much, rad.
+fn largest_change(result: &TeleoperatedFrame) -> Option<(usize, f32)> {
+    let change = result.filter.as_ref()?.change.iter().copied().enumerate();
+    change.max_by(|(_, a), (_, b)| a.abs().total_cmp(&b.abs()))
+}
+
+fn line(result: &TeleoperatedFrame, joints: &[String]) -> String {
+    let number = result.header.unwrap_or_default().sequence_number;
+    let age = pose_age_ms(result).map_or_else(|| "-".to_owned(), |age| format!("{age:.0}"));
+    let mode = short(result.emp_mode().as_str_name(), "EMP_MODE_");
+    let guard = result.guard.clone().unwrap_or_default();
+    let goal = if guard.progress > 0.0 {
+        format!("{} {:.0} %", phase_name(result), 100.0 * guard.progress)
+    } else {
+        phase_name(result)
+    };
+    let filter = result.filter.clone().unwrap_or_default();
+    let (index, change) = largest_change(result).unwrap_or_default();
+    let joint = joints.get(index).map_or("", String::as_str);
+    let danger = if filter.danger { "yes" } else { "no" };
+    format!(
+        "{number:<8}  {age:>7}  {mode:<11}  {goal:<20}  {change:>10.3}  {joint:<21}  {danger:<6}  {:>7.3}  {:>7.3}",
+        filter.center_of_mass_margin, filter.smallest_link_distance
+    )
+}
+
+fn json_line(result: &TeleoperatedFrame) -> Value {
+    let filter = result.filter.clone().unwrap_or_default();
+    let guard = result.guard.clone().unwrap_or_default();
+    let reasons = filter
+        .reasons()
+        .map(|reason| short(reason.as_str_name(), "CHANGE_REASON_"));
+    json!({
+        "frame": result.header.unwrap_or_default().sequence_number,
+        "pose": result.pose.as_ref().map(|pose| pose.header.unwrap_or_default().sequence_number),
+        "pose_age_ms": pose_age_ms(result),
+        "emp_mode": short(result.emp_mode().as_str_name(), "EMP_MODE_"),
+        "phase": phase_name(result),
+        "progress": guard.progress,
+        "emp_progress": guard.emp_progress,
+        "speed_limited_joints": guard.speed_limited_joints,
+        "goal": result.goal,
+        "executable_goal": filter.executable_goal,
+        "regloss": filter.regloss,
+        "danger": filter.danger,
+        "center_of_mass_margin": filter.center_of_mass_margin,
+        "smallest_link_distance": filter.smallest_link_distance,
+        "reasons": reasons.collect::<Vec<_>>(),
+        "leg_targets": result.leg_targets,
+        "missed": result.missed,
+    })
+}
+
+/// What a session executed while its operator was there.
+#[derive(Default)]
+struct Summary {
+    executed: u64,
+    missed: u64,
+    phases: BTreeMap<String, u64>,
+    danger: u64,
+    /// Largest change of a joint's goal, rad.
+    change: f32,
+    /// Smallest margin of the centre of mass, m.
+    margin: Option<f32>,
+}
+
+impl Summary {
+    fn add(&mut self, result: &TeleoperatedFrame) {
+        self.executed += 1;
+        self.missed += result.missed;
+        *self.phases.entry(phase_name(result)).or_default() += 1;
+        let (_, change) = largest_change(result).unwrap_or_default();
+        self.change = self.change.max(change.abs());
+        if let Some(filter) = &result.filter {
+            self.danger += u64::from(filter.danger);
+            let margin = filter.center_of_mass_margin;
+            self.margin = Some(self.margin.map_or(margin, |least| least.min(margin)));
+        }
+    }
+
+    fn json(&self) -> Value {
+        json!({
+            "executed": self.executed,
+            "missed": self.missed,
+            "phases": self.phases,
+            "danger": self.danger,
+            "largest_change": self.change,
+            "smallest_margin": self.margin,
+        })
+    }
+
+    fn print(&self) {
+        println!("{} control periods executed", self.executed);
+        for (phase, count) in &self.phases {
+            println!("  {phase:<10} {count}");
+        }
+        println!("  danger     {}", self.danger);
+        println!("  largest change of a goal {:.3} rad", self.change);
+        if let Some(margin) = self.margin {
+            println!("  smallest margin of the centre of mass {margin:.3} m");
+        }
+    }
+}

@@ -3,6 +3,7 @@
 mod fall_report;
 mod policy_report;
 mod train_emp;
+mod train_world_model;
 mod trial;
 
 use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
@@ -64,6 +65,15 @@ enum Command {
     ///
     /// Runs, checkpoints and the table stand in runs/ablation-ROBOT; Ctrl-C saves, --resume continues.
     EmpAblation(train_emp::AblationArguments),
+    /// Train a world model of a robot and its policy (paper, section V).
+    ///
+    /// Procedural skills are always in the mix; recorded motion comes from --motions. The run's checkpoint, CSV log and model
+    /// stand in runs/world-model-ROBOT; Ctrl-C saves, --resume continues bit for bit.
+    WorldModel(train_world_model::Arguments),
+    /// Measure how well a world model predicts, one and ten control periods ahead.
+    ///
+    /// Motion as for policy-report, under the hard conditions of training.
+    WorldModelReport(train_world_model::ReportArguments),
     /// Draw the learning curves of policies.
     PolicyCurves(CurvesArguments),
     /// Score a trained policy, bare and behind goal filters: held-out clips, larger amplitude, full randomisation.
@@ -225,6 +235,8 @@ fn main() -> Result<ExitCode> {
         }
         Command::Emp(arguments) => train_emp::run(&arguments),
         Command::EmpAblation(arguments) => train_emp::run_ablation(&arguments),
+        Command::WorldModel(arguments) => train_world_model::run(&arguments),
+        Command::WorldModelReport(arguments) => train_world_model::report(&arguments),
         Command::PolicyReport(arguments) => policy_report::run(&arguments),
         Command::FallReport(arguments) => fall_report::run(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),

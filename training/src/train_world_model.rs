@@ -168,7 +168,7 @@ pub(crate) struct ReportArguments {
     #[arg(long, default_value_t = 256)]
     environments: u64,
     /// Control periods of each.
-    #[arg(long, default_value_t = 400)]
+    #[arg(long, default_value_t = 800)]
     frames: usize,
     /// Print JSON instead of a table.
     #[arg(long)]

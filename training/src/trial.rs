@@ -45,7 +45,7 @@ pub(crate) struct TrialArguments {
     pub(crate) seed: u64,
     /// Threads for physics; the figures do not depend on it.
     #[arg(long, default_value_t = 2)]
-    threads: usize,
+    pub(crate) threads: usize,
 }
 
 impl TrialArguments {

@@ -111,3 +111,10 @@ fn an_emp_that_imagines_resumes_bit_for_bit() {
     let arguments = format!("emp --preset paper {EMP} {sizes}");
     check(&arguments.split_whitespace().collect::<Vec<_>>(), 20);
 }
+
+#[test]
+fn a_world_model_resumes_bit_for_bit() {
+    let arguments = "world-model --steps 100 --environments 8 --rows 16 --loss-steps 3 \
+                     --procedural-clips 2";
+    check(&arguments.split_whitespace().collect::<Vec<_>>(), 4);
+}

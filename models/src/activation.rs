@@ -20,13 +20,8 @@ impl CustomOp1 for Elu {
 
     fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
         let x = values(x, layout)?;
-        let mut out = vec![0.0; x.len()];
-        Arch::new().dispatch(|| {
-            for (out, &x) in out.iter_mut().zip(x) {
-                let negative = exp_non_positive(x.min(0.0)) - 1.0;
-                *out = if x > 0.0 { x } else { negative };
-            }
-        });
+        let mut out = x.to_vec();
+        Arch::new().dispatch(|| apply_elu(&mut out));
         Ok((CpuStorage::F32(out), layout.shape().clone()))
     }
 
@@ -66,6 +61,15 @@ fn values<'a>(storage: &'a CpuStorage, layout: &Layout) -> candle_core::Result<&
     match (storage, layout.contiguous_offsets()) {
         (CpuStorage::F32(values), Some((start, end))) => Ok(&values[start..end]),
         _ => bail!("elu takes contiguous f32 tensors, got the layout {layout:?}"),
+    }
+}
+
+/// Replaces numbers by their ELU, in the vectors of whatever processor the caller is compiled for.
+#[inline(always)]
+pub(crate) fn apply_elu(numbers: &mut [f32]) {
+    for x in numbers {
+        let negative = exp_non_positive(x.min(0.0)) - 1.0;
+        *x = if *x > 0.0 { *x } else { negative };
     }
 }
 

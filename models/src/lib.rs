@@ -17,6 +17,7 @@ pub mod kinematics;
 pub mod linear;
 pub mod observation;
 pub mod optimizer;
+pub mod packed;
 pub mod policy;
 pub mod retarget;
 pub mod world_model;

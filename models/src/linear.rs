@@ -20,10 +20,15 @@ pub fn set_threads(threads: usize) {
     THREADS.set(threads.max(1));
 }
 
+/// How many threads the calling thread's products may use.
+pub(crate) fn threads() -> usize {
+    THREADS.get()
+}
+
 fn parallelism(work: usize) -> Par {
     /// Below this many multiply-adds, waking a second thread costs more than it saves.
     const PARALLEL_WORK: usize = 1 << 20;
-    match THREADS.get() {
+    match threads() {
         1 => Par::Seq,
         threads if work >= PARALLEL_WORK => Par::rayon(threads),
         _ => Par::Seq,

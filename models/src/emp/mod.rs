@@ -9,18 +9,20 @@
 
 mod filter;
 mod network;
+mod packed;
 #[cfg(test)]
 mod tests;
 
 use std::{path::Path, sync::Arc};
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device};
 use candle_nn::VarBuilder;
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
 pub use filter::EmpFilter;
 pub use network::EmpNetwork;
+pub use packed::PackedNetwork;
 
 use crate::{
     CheckpointMetadata, ModelError,
@@ -139,7 +141,9 @@ pub struct EmpAnswer {
 #[derive(Debug)]
 pub struct Emp {
     robot: Arc<Robot>,
-    network: EmpNetwork,
+    config: EmpConfig,
+    normalizer: Normalizer,
+    network: PackedNetwork,
     metadata: CheckpointMetadata,
 }
 
@@ -174,10 +178,14 @@ impl Emp {
         let normalizer = Normalizer::from_tensors(&tensors, config.features())?;
         let vars =
             VarBuilder::from_tensors(tensors.into_iter().collect(), DType::F32, &Device::Cpu);
-        let network = EmpNetwork::new(config, normalizer, &vars.pp(NETWORK_PREFIX))
+        let vars = vars.pp(NETWORK_PREFIX);
+        let network = EmpNetwork::new(config.clone(), normalizer.clone(), &vars)
+            .and_then(|network| network.pack())
             .map_err(|e| format!("the network's tensors: {e}"))?;
         Ok(Self {
             robot,
+            config,
+            normalizer,
             network,
             metadata,
         })
@@ -218,7 +226,7 @@ impl Emp {
 
     /// What the EMP reads, and how.
     pub fn config(&self) -> &EmpConfig {
-        self.network.config()
+        &self.config
     }
 
     /// What the weights say of themselves.
@@ -228,30 +236,38 @@ impl Emp {
 
     /// Executable goals for stacks `S_t` (N × [`ObservationLayout::width`]), the goal that was asked for in each newest frame.
     ///
+    /// A row's answer does not depend on the other rows.
+    ///
     /// # Errors
-    /// When `stacks` is not whole rows, or the tensor library fails.
+    /// When `stacks` is not whole rows.
     pub fn answer(&self, stacks: &[f32]) -> Result<Vec<EmpAnswer>, ModelError> {
-        let layout = &self.config().observation;
+        let layout = &self.config.observation;
         let width = layout.width();
-        let rows = stacks.len() / width;
-        if rows == 0 {
-            return Ok(Vec::new());
+        if !stacks.len().is_multiple_of(width) {
+            let reason = format!("{} numbers are not stacks of {width}", stacks.len());
+            return Err(candle_core::Error::Msg(reason).into());
         }
         let goals: Vec<f32> = stacks
             .chunks_exact(width)
             .flat_map(|stack| &stack[layout.newest_goal()])
             .copied()
             .collect();
-        let stacks = Tensor::from_slice(stacks, (rows, width), &Device::Cpu)?;
-        let goals = Tensor::from_vec(goals, (rows, layout.goal().len()), &Device::Cpu)?;
-        let (executable, latent) = self.network.forward(&stacks, &goals)?;
-        let regloss = latent.sqr()?.mean(1)?.to_vec1::<f32>()?;
-        let executable = executable.to_vec2::<f32>()?;
-        let answers = executable.into_iter().zip(regloss);
+        let mut features = Vec::new();
+        self.config.history_map.apply(layout, stacks, &mut features);
+        self.normalizer.apply(&mut features);
+        let (mut executable, latents) = self.network.forward(&features, &goals)?;
+        if self.config.output == Output::Residual {
+            for (angle, goal) in executable.iter_mut().zip(&goals) {
+                *angle += goal;
+            }
+        }
+        let executable = executable.chunks_exact(layout.goal().len());
+        let latents = latents.chunks_exact(self.config.latent);
+        let answers = executable.zip(latents);
         Ok(answers
-            .map(|(goal, regloss)| EmpAnswer {
-                goal: self.inside_ranges(goal),
-                regloss,
+            .map(|(goal, latent)| EmpAnswer {
+                goal: self.inside_ranges(goal.to_vec()),
+                regloss: latent.iter().map(|z| z * z).sum::<f32>() / latent.len() as f32,
             })
             .collect())
     }

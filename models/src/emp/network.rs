@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 use candle_nn::VarBuilder;
 
-use super::{EmpConfig, Output};
+use super::{EmpConfig, Output, PackedNetwork};
 use crate::{
     checkpoint::Tensors,
     policy::{Mlp, Normalizer},
@@ -64,6 +64,19 @@ impl EmpNetwork {
                 tensors.map(move |(tensor, value)| (format!("{name}.{tensor}"), value))
             })
             .collect()
+    }
+
+    /// The networks for inference, as f16 where that loses nothing.
+    ///
+    /// # Errors
+    /// When the tensors are not f32.
+    pub fn pack(&self) -> candle_core::Result<PackedNetwork> {
+        Ok(PackedNetwork {
+            state: self.state.pack()?,
+            target: self.target.pack()?,
+            fusion: self.fusion.pack()?,
+            decoder: self.decoder.pack()?,
+        })
     }
 
     /// The executable goals ĝ (N × goal joints, rad, not held inside the joints' ranges) and the latents z

@@ -1,3 +1,4 @@
+use candle_core::Tensor;
 use candle_nn::VarMap;
 
 use super::*;
@@ -76,10 +77,7 @@ fn a_saved_emp_loads_and_a_batch_equals_its_rows() {
         let batch = emp.answer(&stacks).unwrap();
         for (stack, expected) in stacks.chunks(width).zip(&batch) {
             let answer = &emp.answer(stack).unwrap()[0];
-            assert!((answer.regloss - expected.regloss).abs() < 1e-5);
-            for (a, b) in answer.goal.iter().zip(&expected.goal) {
-                assert!((a - b).abs() < 1e-5, "{a} {b}");
-            }
+            assert_eq!(answer, expected);
             let inside = robot
                 .goal_joints()
                 .iter()
@@ -88,6 +86,46 @@ fn a_saved_emp_loads_and_a_batch_equals_its_rows() {
             assert!(inside, "{answer:?}");
         }
         assert!(emp.answer(&[]).unwrap().is_empty());
+        assert!(emp.answer(&stacks[1..]).is_err());
+    }
+}
+
+#[test]
+fn answers_are_the_candle_networks() {
+    let robot = robot();
+    for output in [Output::Absolute, Output::Residual] {
+        let config = config(&robot, output);
+        let features = config.features();
+        let normalizer = Normalizer {
+            mean: (0..features).map(|i| (i as f32).cos()).collect(),
+            scale: vec![0.7; features],
+        };
+        let vars = VarMap::new();
+        let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
+        let network = EmpNetwork::new(config.clone(), normalizer.clone(), &builder).unwrap();
+        let mut tensors: Tensors = normalizer.tensors().unwrap().into_iter().collect();
+        for (name, tensor) in network.tensors() {
+            tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor);
+        }
+        let metadata = emp_metadata(&robot);
+        let emp = Emp::from_tensors(config.clone(), Arc::clone(&robot), tensors, metadata).unwrap();
+        let (stacks, width) = (stacks(&config, 3), config.observation.width());
+        let goals = stacks.chunks(width);
+        let goals = goals.flat_map(|stack| stack[config.observation.newest_goal()].to_vec());
+        let goals = Tensor::from_iter(goals, &Device::Cpu).unwrap();
+        let goals = goals.reshape((3, ())).unwrap();
+        let tensor = Tensor::from_slice(&stacks, (3, width), &Device::Cpu).unwrap();
+        let (executable, latent) = network.forward(&tensor, &goals).unwrap();
+        let latent = latent.sqr().unwrap().mean(1).unwrap();
+        let rows = executable.to_vec2::<f32>().unwrap().into_iter();
+        let expected = rows.zip(latent.to_vec1::<f32>().unwrap());
+        for (answer, (goal, regloss)) in emp.answer(&stacks).unwrap().iter().zip(expected) {
+            let goal = emp.inside_ranges(goal);
+            assert!((answer.regloss - regloss).abs() < 1e-5);
+            for (a, b) in answer.goal.iter().zip(goal) {
+                assert!((a - b).abs() < 1e-5, "{a} {b}");
+            }
+        }
     }
 }
 

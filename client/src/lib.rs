@@ -48,9 +48,9 @@ pub use emp_proto::v1::{
     CollectStarted, Delivery, DropReason, EmpMode, EpisodeEnd, EpisodeFinished, EpisodeMetrics,
     EpisodeResult, EvaluateConfig, EvaluationMetrics, EvaluationResult, EvaluationStarted,
     FilterResult, GoalClip, GoalPhase, GoalStatistics, GuardReport, Joint, KeyNode, MassRange,
-    Metric, Model, PoseReport, ProceduralClips, Push, RampCause, Randomization, Robot,
+    Metric, Model, ModelKind, PoseReport, ProceduralClips, Push, RampCause, Randomization, Robot,
     RolloutBlock, Spread, StepEnd, TeleoperatedFrame, TeleoperationPresence, TeleoperationStarted,
-    TrainingEnd, evaluate_response::Message as EvaluationEvent,
+    Timing, TrainingEnd, evaluate_response::Message as EvaluationEvent,
 };
 pub use error::ClientError;
 pub use rollouts::{Collection, Evaluation};

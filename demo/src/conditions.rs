@@ -7,16 +7,25 @@ use nalgebra::Vector3;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-/// Time between two pushes, seconds: the paper's.
-const PUSH_INTERVAL: f64 = 5.0;
+/// Time between two pushes, seconds: the paper's, and a shorter one for motions of a few seconds.
+pub(crate) const PUSH_INTERVAL: f64 = 5.0;
+pub(crate) const SHORT_PUSH_INTERVAL: f64 = 1.5;
+
+/// Pushes of the base.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pushes {
+    /// What a push adds to the base's speed, m/s; 0: there are none.
+    pub(crate) speed: f64,
+    /// Time between two pushes, seconds.
+    pub(crate) interval: f64,
+}
 
 /// What follows from the seed.
 #[derive(Clone, Debug)]
 pub(crate) struct Conditions {
     /// Mass added to the left and the right hand, kg.
     pub(crate) hand_load: [f64; 2],
-    /// What a push adds to the base's speed, m/s; 0: there are none.
-    pub(crate) push_speed: f64,
+    pub(crate) pushes: Pushes,
     push_directions: ChaCha8Rng,
     /// Frames between two pushes.
     push_interval: usize,
@@ -24,15 +33,15 @@ pub(crate) struct Conditions {
 
 impl Conditions {
     /// Draws the loads from the robot's range for tests, unless `load` says how much both hands carry, kg.
-    pub(crate) fn new(robot: &Robot, seed: u64, load: Option<f64>, push_speed: f64) -> Self {
+    pub(crate) fn new(robot: &Robot, seed: u64, load: Option<f64>, pushes: Pushes) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let [low, high] = robot.added_masses().test_hand;
         let drawn = [0, 1].map(|_| rng.random_range(low..=high));
         Self {
             hand_load: load.map_or(drawn, |load| [load; 2]),
-            push_speed,
+            pushes,
             push_directions: rng,
-            push_interval: (PUSH_INTERVAL * robot.control_rate_hz()).round() as usize,
+            push_interval: (pushes.interval * robot.control_rate_hz()).round() as usize,
         }
     }
 
@@ -40,12 +49,12 @@ impl Conditions {
     /// for each frame in turn.
     pub(crate) fn push(&mut self, frame: usize) -> Option<Vector3<f64>> {
         let due = frame > 0 && frame.is_multiple_of(self.push_interval);
-        if !due || self.push_speed == 0.0 {
+        if !due || self.pushes.speed == 0.0 {
             return None;
         }
         let direction = self.push_directions.random_range(0.0..TAU);
         let (y, x) = direction.sin_cos();
-        Some(self.push_speed * Vector3::new(x, y, 0.0))
+        Some(self.pushes.speed * Vector3::new(x, y, 0.0))
     }
 }
 
@@ -60,8 +69,13 @@ mod tests {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../robots/emp27");
         let robot = Robot::load(&folder).unwrap();
         let [low, high] = robot.added_masses().test_hand;
+        let pushes = |speed| Pushes {
+            speed,
+            interval: PUSH_INTERVAL,
+        };
         for seed in 0..20 {
-            let [mut first, mut second] = [0, 1].map(|_| Conditions::new(&robot, seed, None, 0.3));
+            let [mut first, mut second] =
+                [0, 1].map(|_| Conditions::new(&robot, seed, None, pushes(0.3)));
             assert_eq!(first.hand_load, second.hand_load);
             assert!(
                 first
@@ -76,7 +90,7 @@ mod tests {
                 assert!(push.is_none_or(|push| (push.norm() - 0.3).abs() < 1e-12));
             }
         }
-        let mut loaded = Conditions::new(&robot, 1, Some(2.0), 0.0);
+        let mut loaded = Conditions::new(&robot, 1, Some(2.0), pushes(0.0));
         assert_eq!(loaded.hand_load, [2.0; 2]);
         assert!((0..600).all(|frame| loaded.push(frame).is_none()));
     }

@@ -35,11 +35,16 @@ impl Motion {
             .context("a motion file has no name")?
             .to_string_lossy()
             .into_owned();
-        Ok(Self {
+        Ok(Self::whole(name, clip.resampled(rate)))
+    }
+
+    /// A clip at the robot's control rate whose parts have no names.
+    pub(crate) fn whole(name: String, clip: Clip) -> Self {
+        Self {
             name,
-            clip: clip.resampled(rate),
+            clip,
             parts: Vec::new(),
-        })
+        }
     }
 
     fn medley(rate: f64) -> Self {

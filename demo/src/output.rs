@@ -15,13 +15,12 @@ use crate::motion::Motion;
 use crate::picture::{Moment, Sheet, StanceSheet, differing};
 use crate::posture::Posture;
 
-/// The files, in the order in which they are written.
-const FILES: [&str; 4] = [
-    "joints.csv",
-    "summary.json",
-    "contact-sheet.png",
-    "stance-sheet.png",
-];
+/// The output folder, and what was written there.
+pub(crate) struct Files<'a> {
+    folder: &'a Path,
+    /// Names of the files, in the order in which they were written.
+    pub(crate) written: Vec<&'static str>,
+}
 
 /// How many moments the sheets show.
 const MOMENTS: usize = 8;
@@ -79,7 +78,7 @@ pub(crate) fn sheets(
         moments: &moments,
         stances: &stances,
         rate: robot.control_rate_hz(),
-        fall: summary.fall().map(|fall| fall.time),
+        fall: summary.fall_time(),
         pushes: &pushes,
     };
     let context = || format!("cannot draw {}", robot.name());
@@ -100,53 +99,56 @@ fn last_of_fall(run: &Run) -> Option<usize> {
     run.fall.and_then(|_| run.periods.len().checked_sub(1))
 }
 
-/// Writes every file under a temporary name and renames it when it is whole; gives their names.
-pub(crate) fn write(
-    out: &Path,
-    robot: &Robot,
-    run: &Run,
-    summary: &Summary,
-    sheets: &[Vec<u8>; 2],
-) -> Result<Vec<&'static str>> {
-    let [joints, json, contact, stance] = FILES.map(|name| out.join(name));
-    write_joints(&joints, robot, run)?;
-    write_whole(&json, summary.json()?.as_bytes())?;
-    write_whole(&contact, &sheets[0])?;
-    write_whole(&stance, &sheets[1])?;
-    Ok(FILES.to_vec())
-}
-
-/// A row a frame: the goals as the retargeter answered, what all motors followed, and what was then measured.
-fn write_joints(path: &Path, robot: &Robot, run: &Run) -> Result<()> {
-    let named =
-        |what: &'static str| move |joint: &emp_robot::Joint| format!("{what}:{}", joint.name);
-    let goals = robot.goal_joints().iter().map(named("goal"));
-    let executed = robot.joints().map(named("executed"));
-    let measured = robot.joints().map(named("measured"));
-    let names: Vec<String> = goals.chain(executed).chain(measured).collect();
-    let mut csv = JointCsvWriter::create(path, &names)?;
-    for (frame, period) in run.periods.iter().enumerate() {
-        let row = [
-            period.goal.as_slice(),
-            &period.targets.goal,
-            &period.targets.legs,
-            &period.reading.joint_positions,
-        ];
-        csv.write_row(frame as f64 / robot.control_rate_hz(), &row.concat())?;
+impl<'a> Files<'a> {
+    /// Nothing was written yet.
+    pub(crate) fn new(folder: &'a Path) -> Self {
+        Self {
+            folder,
+            written: Vec::new(),
+        }
     }
-    Ok(csv.finish()?)
-}
 
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let context = || format!("cannot write {}", path.display());
-    let folder = path.parent().with_context(context)?;
-    // As any new file: readable for others where the user's mask allows it.
-    let everyone = Permissions::from_mode(0o666);
-    let mut file = tempfile::Builder::new()
-        .permissions(everyone)
-        .tempfile_in(folder)
-        .with_context(context)?;
-    file.write_all(bytes).with_context(context)?;
-    file.persist(path).with_context(context)?;
-    Ok(())
+    /// Writes a run as a table: a row a frame with the person's goals, what all motors followed, and what was then measured.
+    pub(crate) fn write_joints(
+        &mut self,
+        name: &'static str,
+        robot: &Robot,
+        run: &Run,
+    ) -> Result<()> {
+        let named =
+            |what: &'static str| move |joint: &emp_robot::Joint| format!("{what}:{}", joint.name);
+        let goals = robot.goal_joints().iter().map(named("goal"));
+        let executed = robot.joints().map(named("executed"));
+        let measured = robot.joints().map(named("measured"));
+        let names: Vec<String> = goals.chain(executed).chain(measured).collect();
+        let mut csv = JointCsvWriter::create(&self.folder.join(name), &names)?;
+        for (frame, period) in run.periods.iter().enumerate() {
+            let row = [
+                period.answer.person.as_slice(),
+                &period.answer.targets.goal,
+                &period.answer.targets.legs,
+                &period.reading.joint_positions,
+            ];
+            csv.write_row(frame as f64 / robot.control_rate_hz(), &row.concat())?;
+        }
+        csv.finish()?;
+        self.written.push(name);
+        Ok(())
+    }
+
+    /// Writes a file under a temporary name and renames it when it is whole.
+    pub(crate) fn write(&mut self, name: &'static str, bytes: &[u8]) -> Result<()> {
+        let path = self.folder.join(name);
+        let context = || format!("cannot write {}", path.display());
+        // As any new file: readable for others where the user's mask allows it.
+        let everyone = Permissions::from_mode(0o666);
+        let mut file = tempfile::Builder::new()
+            .permissions(everyone)
+            .tempfile_in(self.folder)
+            .with_context(context)?;
+        file.write_all(bytes).with_context(context)?;
+        file.persist(&path).with_context(context)?;
+        self.written.push(name);
+        Ok(())
+    }
 }

@@ -6,7 +6,7 @@ use emp_robot::Robot;
 use emp_sim::Skeleton;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-use crate::control::Run;
+use crate::control::{Period, Run};
 use crate::stance::Stance;
 
 /// The robot at the end of a control period.
@@ -22,7 +22,7 @@ pub(crate) struct Posture {
 /// The postures of a run, one a control period.
 pub(crate) fn postures(robot: &Robot, run: &Run) -> Result<Vec<Posture>> {
     let mut skeleton = Skeleton::new(robot)?;
-    let posture = |period: &crate::control::Period| {
+    let posture = |period: &Period| {
         let pose = skeleton.pose(&period.reading.joint_positions);
         Posture {
             pose: robot_pose(&pose.key_nodes, &pose.wrist_rotations),

@@ -1,7 +1,8 @@
-//! The pictures: what the person did above what the robot did, and how the robot stood meanwhile.
+//! The pictures: what the person did above what the robot did, how the robot stood meanwhile, and what the EMP does about it.
 
 mod canvas;
 mod chart;
+mod emp_sheet;
 mod figure;
 mod moments;
 mod sheet;
@@ -15,6 +16,7 @@ use emp_motion::KeyNodeFrame;
 use crate::stance::Stance;
 use figure::{Figure, Leg};
 
+pub(crate) use emp_sheet::{Curve, EmpSheet, JointCurves, OFF, ON, Standing, Strip};
 pub(crate) use moments::differing;
 pub(crate) use sheet::Sheet;
 pub(crate) use stance_sheet::StanceSheet;

@@ -1,0 +1,170 @@
+//! The stream that closes the loop: `Teleoperate` with both ends in one client.
+
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use emp_client::{
+    Client, EmpMode, GoalPhase, GuardReport, RampCause, TeleoperatedFrame, TeleoperationAnswer,
+    TeleoperationConfig, TeleoperationFrame,
+};
+use emp_motion::KeyNodeFrame;
+use emp_robot::{Joint, Robot};
+use emp_sim::Reading;
+
+use crate::simulator::JointTargets;
+use crate::stream::{Numbered, Stream};
+
+/// What the server answers to a control period.
+#[derive(Clone)]
+pub(crate) struct Answered {
+    /// What the person's pose asks of the goal joints, radians.
+    pub(crate) person: Vec<f32>,
+    /// The goal before the EMP, radians: that of the person, or on a ramp to it.
+    pub(crate) goal: Vec<f32>,
+    /// What the robot's motors are to follow.
+    pub(crate) targets: JointTargets,
+    /// When the EMP changes goals.
+    pub(crate) emp_mode: EmpMode,
+    /// How far the centre of mass is inside the support polygon of the feet, metres.
+    pub(crate) margin: f32,
+    /// What the guards did, in words.
+    pub(crate) guards: Vec<String>,
+    /// Time in the retargeter, and in EMP and policy; none where nothing was computed.
+    pub(crate) times: Option<[Duration; 2]>,
+}
+
+impl Answered {
+    /// A robot in its default pose that was not told anything yet.
+    pub(crate) fn resting(robot: &Robot) -> Self {
+        let angles = |joints: &[Joint]| -> Vec<f32> {
+            joints.iter().map(|joint| joint.default as f32).collect()
+        };
+        let goal = angles(robot.goal_joints());
+        Self {
+            person: goal.clone(),
+            goal: goal.clone(),
+            targets: JointTargets {
+                goal,
+                legs: angles(robot.leg_joints()),
+            },
+            emp_mode: EmpMode::Unspecified,
+            margin: 0.0,
+            guards: Vec::new(),
+            times: None,
+        }
+    }
+
+    /// The same for a period that was not answered.
+    pub(crate) fn again(&self) -> Self {
+        Self {
+            guards: Vec::new(),
+            times: None,
+            ..self.clone()
+        }
+    }
+
+    fn new(frame: TeleoperatedFrame) -> Result<Self> {
+        let emp_mode = frame.emp_mode();
+        let pose = frame.pose.context("an answer without a pose")?;
+        let filter = frame.filter.context("an answer without an assessment")?;
+        let time = |timing: Option<&emp_client::Timing>| -> Option<Duration> {
+            timing?.inference_time?.try_into().ok()
+        };
+        let times = time(pose.timing.as_ref()).zip(time(frame.timing.as_ref()));
+        Ok(Self {
+            person: pose.goal,
+            goal: frame.goal,
+            targets: JointTargets {
+                goal: filter.executable_goal,
+                legs: frame.leg_targets,
+            },
+            emp_mode,
+            margin: filter.center_of_mass_margin,
+            guards: frame.guard.as_ref().map_or_else(Vec::new, in_words),
+            times: times.map(|(retargeter, policy)| [retargeter, policy]),
+        })
+    }
+}
+
+/// What the guards did in a control period.
+fn in_words(report: &GuardReport) -> Vec<String> {
+    let phase = match (report.phase(), report.cause()) {
+        (GoalPhase::Unspecified | GoalPhase::Following, _) => None,
+        (GoalPhase::Ramping, RampCause::OperatorReturned) => Some("ramp to the person's pose"),
+        (GoalPhase::Ramping, _) => Some("ramp from the measured pose"),
+        (GoalPhase::Holding, _) => Some("hold without a fresh pose"),
+        (GoalPhase::Returning, _) => Some("return to the default pose"),
+        (GoalPhase::Resting, _) => Some("rest in the default pose"),
+    };
+    let fade = report.emp_progress.map(|_| "blend the EMP in");
+    let limited = report.speed_limited_joints.iter();
+    let limited = limited.map(|joint| format!("limit the speed of {joint}"));
+    let stages = phase.into_iter().chain(fade).map(str::to_owned);
+    stages.chain(limited).collect()
+}
+
+/// A stream in which the robot follows the person.
+pub(crate) struct Teleoperation(Stream<TeleoperationFrame, TeleoperationAnswer>);
+
+impl Numbered for TeleoperationAnswer {
+    fn number(&self) -> u64 {
+        self.sequence_number
+    }
+}
+
+impl Teleoperation {
+    pub(crate) async fn start(client: &Client, robot: &Robot, emp_mode: EmpMode) -> Result<Self> {
+        let config = TeleoperationConfig {
+            emp_mode,
+            ..TeleoperationConfig::new(robot.name(), "")
+        };
+        let stream = Stream::new(client.teleoperate(config).await?);
+        stream.check_joints(robot.joints().map(|joint| joint.name.as_str()))?;
+        Ok(Self(stream))
+    }
+
+    /// A pose and the robot's state become targets.
+    pub(crate) async fn ask(&mut self, pose: &KeyNodeFrame, reading: &Reading) -> Result<Answered> {
+        let frame = TeleoperationFrame {
+            pose: Some(pose.clone()),
+            joint_positions: reading.joint_positions.clone(),
+            orientation: reading.orientation,
+            reset: false,
+            emp_mode: EmpMode::Unspecified,
+        };
+        Answered::new(self.0.ask(&frame).await?.result)
+    }
+
+    /// Ends the stream and waits for what is still on its way.
+    pub(crate) async fn finish(self) -> Result<()> {
+        self.0.finish().await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_guard_has_its_words() {
+        let mut report = GuardReport {
+            phase: GoalPhase::Following.into(),
+            ..GuardReport::default()
+        };
+        assert!(in_words(&report).is_empty());
+        report.phase = GoalPhase::Ramping.into();
+        report.cause = RampCause::FirstFrame.into();
+        report.emp_progress = Some(0.5);
+        report.speed_limited_joints = vec!["waist_yaw".to_owned()];
+        assert_eq!(
+            in_words(&report),
+            [
+                "ramp from the measured pose",
+                "blend the EMP in",
+                "limit the speed of waist_yaw"
+            ]
+        );
+        report.cause = RampCause::OperatorReturned.into();
+        assert_eq!(in_words(&report)[0], "ramp to the person's pose");
+    }
+}

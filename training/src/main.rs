@@ -1,5 +1,6 @@
 //! `emp-train`: trains the models and reports on them.
 
+mod emp_report;
 mod fall_report;
 mod policy_report;
 mod train_emp;
@@ -81,6 +82,10 @@ enum Command {
     /// Recorded motion comes from --motions and should be of people that were not trained on; procedural skills come from a
     /// seed of their own.
     PolicyReport(policy_report::Arguments),
+    /// Compare EMPs with the policy alone and with filters that need no learning, on nominal, easy and hard conditions.
+    ///
+    /// Motion as for policy-report. Prints tables in Markdown, all differences on the same episodes.
+    EmpReport(emp_report::Arguments),
     /// Find out what fells a policy under hard conditions: joints, directions, poses, and how early it shows.
     ///
     /// Motion as for policy-report. Prints a page in Markdown.
@@ -238,6 +243,7 @@ fn main() -> Result<ExitCode> {
         Command::WorldModel(arguments) => train_world_model::run(&arguments),
         Command::WorldModelReport(arguments) => train_world_model::report(&arguments),
         Command::PolicyReport(arguments) => policy_report::run(&arguments),
+        Command::EmpReport(arguments) => emp_report::run(&arguments),
         Command::FallReport(arguments) => fall_report::run(&arguments),
         Command::RetargetReport(arguments) => report_retargeter(&arguments),
     }

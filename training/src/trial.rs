@@ -19,8 +19,8 @@ use emp_training::{
 
 use crate::{policy_weights, retargeter_weights};
 
-/// With --quick, one clip of so many is played.
-const QUICK: usize = 4;
+/// Training draws its skills from other seeds.
+const PROCEDURAL_SEED: u64 = 0x7265_706f_7274;
 
 /// Whom to try, and on what.
 #[derive(Args)]
@@ -31,7 +31,13 @@ pub(crate) struct TrialArguments {
     /// Procedural motions, cut into clips like the recorded ones.
     #[arg(long, default_value_t = 100)]
     procedural: usize,
-    /// Play only every fourth clip.
+    /// Seed of the procedural motions: the usual one is no training's.
+    #[arg(long, default_value_t = PROCEDURAL_SEED)]
+    procedural_seed: u64,
+    /// Play at most so many of the clips, evenly spread over them.
+    #[arg(long, default_value_t = 320)]
+    clips: usize,
+    /// Play a quarter of that number.
     #[arg(long)]
     quick: bool,
     /// The policy [default: models/weights/ROBOT-policy.safetensors].
@@ -60,8 +66,6 @@ impl TrialArguments {
 
     /// The clips: none of them was trained on, if --motions are other people's than in training.
     pub(crate) fn clips(&self, robot: &Arc<Robot>) -> Result<Vec<GoalClip>> {
-        /// Training draws its skills from other seeds.
-        const SEED: u64 = 0x7265_706f_7274;
         let weights = retargeter_weights(self.retargeter.as_ref(), robot);
         let retargeter = Retargeter::load(&weights, Arc::clone(robot))?;
         let recorded = if self.motions.is_empty() {
@@ -69,15 +73,26 @@ impl TrialArguments {
         } else {
             data::load_clips(&self.motions)?
         };
-        let skills = emp_motion::skills::library(SEED, self.procedural);
+        let skills = emp_motion::skills::library(self.procedural_seed, self.procedural);
         let mut windows = Vec::new();
         for (motion, source) in [(recorded, Source::Recorded), (skills, Source::Procedural)] {
             let clips = GoalClip::retargeted(&retargeter, &motion, source, self.threads)?;
             windows.extend(clips.iter().flat_map(|clip| clip.windows(report::FRAMES)));
         }
-        let step = if self.quick { QUICK } else { 1 };
-        Ok(windows.into_iter().step_by(step).collect())
+        let most = if self.quick {
+            self.clips / 4
+        } else {
+            self.clips
+        };
+        Ok(spread(&windows, most))
     }
+}
+
+/// At most `most` of the clips, at even distances.
+fn spread(clips: &[GoalClip], most: usize) -> Vec<GoalClip> {
+    let count = most.min(clips.len());
+    let chosen = (0..count).map(|i| clips[i * clips.len() / count].clone());
+    chosen.collect()
 }
 
 /// A report as it is printed.

@@ -21,7 +21,7 @@ pub(super) fn auroc(positive: &[f64], negative: &[f64]) -> Option<f64> {
 }
 
 /// The value below which `share` of `values` lie (nearest rank); none of none.
-pub(super) fn percentile(mut values: Vec<f64>, share: f64) -> Option<f64> {
+pub(in crate::emp) fn percentile(mut values: Vec<f64>, share: f64) -> Option<f64> {
     values.sort_by(f64::total_cmp);
     let last = values.len().checked_sub(1)?;
     values.get((share * last as f64).round() as usize).copied()

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use emp_models::observation::projected_gravity;
 use emp_robot::Robot;
 use emp_sim::evaluation::{ExecutedFrame, Observer};
-use nalgebra::Vector2;
+use nalgebra::{UnitQuaternion, Vector2};
 
 use super::reach::{Reach, ReachMeter};
 
@@ -25,6 +25,12 @@ pub(super) struct Moment {
     pub(super) reach: Reach,
     /// The regloss, with an EMP.
     pub(super) regloss: Option<f64>,
+}
+
+/// Angle between the base's vertical axis and the world's, rad.
+pub(in crate::emp) fn tilt(orientation: &UnitQuaternion<f64>) -> f64 {
+    let [_, _, down] = projected_gravity(orientation);
+    (-down).clamp(-1.0, 1.0).acos()
 }
 
 /// Keeps every frame of every episode.
@@ -69,7 +75,7 @@ impl Observer for Tracer {
         let moment = Moment {
             static_com: self.static_com(&frame.output.goal),
             measured_com: frame.reading.center_of_mass_over_feet(),
-            tilt: (-gravity[2]).clamp(-1.0, 1.0).acos(),
+            tilt: tilt(&frame.reading.orientation),
             lean: Vector2::new(gravity[0], gravity[1]),
             reach: self.reach.measure(frame.asked),
             regloss: frame.output.risk.map(|risk| f64::from(risk.regloss)),

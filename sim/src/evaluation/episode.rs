@@ -10,10 +10,10 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::observer::ExecutedFrame;
-use super::settings::Pushes;
 use crate::environment::{EndReason, EnvironmentConfig, Randomization, leg_targets, within};
 use crate::goals::{GoalClip, Source};
 use crate::metrics::{EpisodeSums, Frame};
+use crate::pushes::{PushClock, Pushes};
 use crate::{Body, Stage, Start, Targets};
 
 /// What all episodes of an evaluation share.
@@ -54,8 +54,7 @@ pub(super) struct Episode<'a> {
     rng: ChaCha8Rng,
     body: Body,
     state: ControllerState,
-    /// Control periods until the next push.
-    until_push: usize,
+    pushes: PushClock,
     legs: Vec<f32>,
     /// Control periods that were executed.
     executed: usize,
@@ -91,7 +90,7 @@ impl<'a> Episode<'a> {
             .collect();
         let hanging: f64 = rng.random();
         let hang = ranges.hang.filter(|hang| hanging < hang.ratio);
-        let interval = setting.pushes.map_or(1, |pushes| pushes.interval(robot));
+        let pushes = PushClock::new(setting.pushes, robot, &mut rng);
         Self {
             number,
             clip,
@@ -100,7 +99,7 @@ impl<'a> Episode<'a> {
                 lift: hang.map_or(0.0, |hang| hang.height),
                 parameters,
             }),
-            until_push: rng.random_range(0..interval),
+            pushes,
             rng,
             state,
             legs: vec![0.0; robot.leg_joints().len()],
@@ -134,7 +133,8 @@ impl<'a> Episode<'a> {
 
     /// One control period with the controller's answer.
     pub(super) fn step(&mut self, setting: &Setting, stage: &mut Stage, output: &ControllerOutput) {
-        self.push(setting);
+        self.pushes
+            .tick(&setting.robot, &mut self.body, &mut self.rng);
         match setting.randomization.action {
             Some(noise) => leg_targets(
                 &setting.robot,
@@ -194,18 +194,5 @@ impl<'a> Episode<'a> {
             failure: self.outcome?,
             sums: self.sums,
         })
-    }
-
-    fn push(&mut self, setting: &Setting) {
-        let Some(pushes) = setting.pushes else {
-            return;
-        };
-        if self.until_push > 0 {
-            self.until_push -= 1;
-            return;
-        }
-        self.until_push = pushes.interval(&setting.robot) - 1;
-        let [linear, angular] = pushes.draw(&mut self.rng);
-        self.body.push(linear, angular);
     }
 }

@@ -1,14 +1,11 @@
 //! Under what conditions a controller is evaluated.
 
-use std::f64::consts::TAU;
-
 use emp_robot::Robot;
-use nalgebra::Vector3;
-use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
-use crate::environment::{MassRange, Push, Randomization};
+use crate::environment::{MassRange, Randomization};
+use crate::pushes::Pushes;
 
 /// How much the simulated robots differ from the model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -112,40 +109,6 @@ impl EvaluationSettings {
         match self.push {
             Some(kick) => (kick.speed > 0.0).then_some(Pushes::Kick(kick)),
             None => randomization.push.map(Pushes::Random),
-        }
-    }
-}
-
-/// Pushes in an evaluation.
-#[derive(Clone, Copy, Debug)]
-pub(super) enum Pushes {
-    /// As in training.
-    Random(Push),
-    /// Of known speed.
-    Kick(Kick),
-}
-
-impl Pushes {
-    /// Control periods between two pushes, at least 1.
-    pub(super) fn interval(&self, robot: &Robot) -> usize {
-        let seconds = match self {
-            Self::Random(push) => push.interval,
-            Self::Kick(kick) => kick.interval,
-        };
-        ((seconds * robot.control_rate_hz()).round() as usize).max(1)
-    }
-
-    /// Draws the jumps of the linear (world frame, m/s) and the angular velocity (base frame, rad/s) of one push.
-    pub(super) fn draw(&self, rng: &mut impl Rng) -> [Vector3<f64>; 2] {
-        match self {
-            Self::Random(push) => push.draw(rng),
-            Self::Kick(kick) => {
-                let (sine, cosine) = rng.random_range(0.0..TAU).sin_cos();
-                [
-                    kick.speed * Vector3::new(cosine, sine, 0.0),
-                    Vector3::zeros(),
-                ]
-            }
         }
     }
 }

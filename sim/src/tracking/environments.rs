@@ -127,16 +127,6 @@ impl TrackingEnvironments {
         &self.setting.kind.robot
     }
 
-    /// The policy that moves the legs.
-    pub fn policy(&self) -> &Arc<Policy> {
-        &self.policy
-    }
-
-    /// The clips that episodes take.
-    pub fn clips(&self) -> &Arc<[GoalClip]> {
-        &self.setting.clips
-    }
-
     /// Where each part of an observation stands.
     pub fn layout(&self) -> &ObservationLayout {
         &self.setting.kind.observation
@@ -156,19 +146,6 @@ impl TrackingEnvironments {
     /// The goals that are asked for, N × goal joints, rad.
     pub fn goals(&self) -> &[f32] {
         &self.batch.goals
-    }
-
-    /// Writes the goals that are asked for `ahead` control periods from now (N × goal joints, rad), as if no episode ended
-    /// before.
-    ///
-    /// # Panics
-    /// If `goals` has another size.
-    pub fn goals_ahead(&self, ahead: usize, goals: &mut [f32]) {
-        let joints = self.layout().goal().len();
-        assert_eq!(goals.len(), joints * self.len(), "goals");
-        for (environment, goal) in self.environments.iter().zip(goals.chunks_exact_mut(joints)) {
-            environment.goal(&self.setting, ahead, goal);
-        }
     }
 
     /// What only a simulation knows, N × [`PrivilegedLayout::width`].

@@ -139,13 +139,6 @@ impl Environment {
         self.subject.observe();
     }
 
-    /// Writes the goal that is asked for `ahead` control periods from now.
-    pub(super) fn goal(&self, setting: &Setting, ahead: usize, goal: &mut [f32]) {
-        let clip = &setting.clips[self.piece.clip];
-        self.piece
-            .goal(clip, &setting.joints, self.age + ahead, goal);
-    }
-
     fn set_goals(&mut self, setting: &Setting) {
         let (piece, age) = (&self.piece, self.age);
         let clip = &setting.clips[piece.clip];

@@ -206,28 +206,6 @@ fn episodes_are_the_clips_and_start_at_their_first_goal() {
 }
 
 #[test]
-fn what_is_seen_ahead_is_asked_for() {
-    let mut environments = environments(plain(), 4, 2);
-    let mut seen = vec![0.0; 4 * JOINTS];
-    environments.goals_ahead(0, &mut seen);
-    assert_eq!(seen, environments.goals());
-    environments.goals_ahead(3, &mut seen);
-    let mut starts = [false; 4];
-    for _ in 0..3 {
-        let goals = environments.goals().to_vec();
-        environments.step(&goals).unwrap();
-        for (any, &start) in starts.iter_mut().zip(environments.starts()) {
-            *any |= start;
-        }
-    }
-    let rows = seen.chunks(JOINTS).zip(environments.goals().chunks(JOINTS));
-    for ((seen, asked), start) in rows.zip(starts) {
-        assert!(start || seen == asked);
-    }
-    assert!(starts.contains(&false));
-}
-
-#[test]
 fn a_fall_ends_an_episode() {
     let settings = TrackingSettings {
         pushed: 1.0,

@@ -75,11 +75,6 @@ impl Explorer {
         }
     }
 
-    /// The environments.
-    pub fn environments(&self) -> &TrackingEnvironments {
-        &self.environments
-    }
-
     /// Runs the environments for `frames` control periods, which `replay` keeps.
     ///
     /// # Errors

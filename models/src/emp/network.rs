@@ -95,6 +95,18 @@ impl EmpNetwork {
         self.forward_features(&self.normalizer.forward(&features)?, goals)
     }
 
+    /// What the state encoder reads, mapped and normalised (N × [`EmpConfig::features`]), for stacks. Not differentiable, and many
+    /// times as fast as the way there through tensors.
+    pub fn features(&self, stacks: &[f32]) -> Vec<f32> {
+        let mut features = Vec::new();
+        let config = &self.config;
+        config
+            .history_map
+            .apply(&config.observation, stacks, &mut features);
+        self.normalizer.apply(&mut features);
+        features
+    }
+
     /// As [`forward`](Self::forward), from features that are mapped and normalised (N × [`EmpConfig::features`]).
     ///
     /// # Errors

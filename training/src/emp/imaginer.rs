@@ -20,7 +20,7 @@ use crate::world_model::{
 };
 
 /// What its environments and its weights have in their seed beside the run's.
-const SEED: u64 = 0x776f_726c_64;
+const SEED: u64 = 0x0077_6f72_6c64;
 
 /// Prefix of its tensors in a checkpoint.
 const PREFIX: &str = "world-model";

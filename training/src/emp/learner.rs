@@ -379,10 +379,11 @@ impl Learner {
         imagination: Option<&Imagination>,
     ) -> Result<Shard> {
         let share = rows.len() as f64 / total as f64;
-        let stacks = gathered(&rollout.stacks, self.layout.width(), rows)?;
+        let stacks = gather(&rollout.stacks, self.layout.width(), rows);
         let moments = self.moments(rollout, rows)?;
         let steps = match imagination {
             Some(imagination) => {
+                let stacks = tensor(&stacks, self.layout.width())?;
                 imagination.unroll(&self.network, &stacks, &moments.goals_ahead)?
             }
             None => vec![self.unimagined(&stacks)?],
@@ -436,13 +437,19 @@ impl Learner {
     }
 
     /// The EMP's answer, and the robot as it is measured.
-    fn unimagined(&self, stacks: &Tensor) -> Result<ImaginedStep> {
+    fn unimagined(&self, stacks: &[f32]) -> Result<ImaginedStep> {
         let layout = &self.layout;
+        let features = tensor(
+            &self.network.features(stacks),
+            self.network.config().features(),
+        )?;
+        let stacks = tensor(stacks, layout.width())?;
         let newest = |part: std::ops::Range<usize>| {
             let start = layout.newest().start + part.start;
             stacks.narrow(1, start, part.len())
         };
-        let (goal, latent) = self.network.forward(stacks, &newest(layout.goal())?)?;
+        let goals = newest(layout.goal())?;
+        let (goal, latent) = self.network.forward_features(&features, &goals)?;
         Ok(ImaginedStep {
             goal,
             latent,

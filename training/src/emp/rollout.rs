@@ -340,14 +340,16 @@ fn answers(
 ) -> Result<Vec<f32>> {
     let width = network.config().observation.width();
     let joints = network.config().observation.goal().len();
+    let inputs = network.config().features();
     let stacks = environments.observations().par_chunks(ROWS * width);
     let goals = environments.goals().par_chunks(ROWS * joints);
     let answers = threads.install(|| {
         let batches = stacks.zip(goals).map(|(stacks, goals)| {
             let rows = goals.len() / joints;
-            let stacks = Tensor::from_slice(stacks, (rows, width), &Device::Cpu)?;
+            let features = network.features(stacks);
+            let features = Tensor::from_vec(features, (rows, inputs), &Device::Cpu)?;
             let goals = Tensor::from_slice(goals, (rows, joints), &Device::Cpu)?;
-            let (executable, _) = network.forward(&stacks, &goals)?;
+            let (executable, _) = network.forward_features(&features, &goals)?;
             executable.flatten_all()?.to_vec1::<f32>()
         });
         batches.collect::<candle_core::Result<Vec<_>>>()

@@ -5,6 +5,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod emp;
 pub mod fake;
 pub mod policy;
 pub mod process;

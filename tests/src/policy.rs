@@ -24,19 +24,7 @@ pub fn write(path: &Path, robot: &Robot, seed: u64) -> anyhow::Result<()> {
     let normalizer = Normalizer::identity(config.features());
     let outputs = robot.leg_joints().len();
     let widths = [&[config.features()], &HIDDEN[..], &[outputs]].concat();
-    let mut rng = StdRng::seed_from_u64(seed);
-    let mut network = Tensors::new();
-    for (layer, pair) in widths.windows(2).enumerate() {
-        let [inputs, outputs] = [pair[0], pair[1]];
-        // Answers are about as large as what is asked.
-        let largest = (3.0 / inputs as f32).sqrt();
-        let mut random = |shape: &[usize]| {
-            let values = (0..shape.iter().product()).map(|_| rng.random_range(-largest..largest));
-            Tensor::from_vec(values.collect::<Vec<f32>>(), shape, &Device::Cpu)
-        };
-        network.insert(format!("{layer}.weight"), random(&[outputs, inputs])?);
-        network.insert(format!("{layer}.bias"), random(&[outputs])?);
-    }
+    let network = random_network(&widths, &mut StdRng::seed_from_u64(seed))?;
     let training = serde_json::json!({ "seed": seed });
     Policy::save(
         path,
@@ -48,6 +36,25 @@ pub fn write(path: &Path, robot: &Robot, seed: u64) -> anyhow::Result<()> {
         String::new(),
     )?;
     Ok(())
+}
+
+/// Tensors of an MLP with random weights, layer by layer; its answers are about as large as what is asked.
+///
+/// # Errors
+/// When the tensor library fails.
+pub(crate) fn random_network(widths: &[usize], rng: &mut StdRng) -> anyhow::Result<Tensors> {
+    let mut network = Tensors::new();
+    for (layer, pair) in widths.windows(2).enumerate() {
+        let [inputs, outputs] = [pair[0], pair[1]];
+        let largest = (3.0 / inputs as f32).sqrt();
+        let mut random = |shape: &[usize]| {
+            let values = (0..shape.iter().product()).map(|_| rng.random_range(-largest..largest));
+            Tensor::from_vec(values.collect::<Vec<f32>>(), shape, &Device::Cpu)
+        };
+        network.insert(format!("{layer}.weight"), random(&[outputs, inputs])?);
+        network.insert(format!("{layer}.bias"), random(&[outputs])?);
+    }
+    Ok(network)
 }
 
 /// A folder of weights for [`emp27`](crate::emp27): the shipped retargeter, and a random policy.

@@ -6,9 +6,14 @@ use emp_proto::v1::{
     StreamRetargetRequest, StreamRetargetResponse, motion_service_client::MotionServiceClient,
     stream_retarget_request::Message, stream_retarget_response,
 };
+use prost::bytes::{Buf as _, BufMut as _};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming, transport::Channel};
+use tonic::{
+    Status, Streaming,
+    codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
+    transport::Channel,
+};
 
 /// A pose as a message.
 pub fn pose(frame: &KeyNodeFrame) -> HumanPose {
@@ -108,5 +113,45 @@ impl RawStream {
             .message()
             .await?
             .and_then(|response| response.message))
+    }
+}
+
+/// Sends bytes as they are, whatever message the server expects, and gives those that come back.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Bytes;
+
+impl Codec for Bytes {
+    type Encode = Vec<u8>;
+    type Decode = Vec<u8>;
+    type Encoder = Self;
+    type Decoder = Self;
+
+    fn encoder(&mut self) -> Self {
+        Self
+    }
+
+    fn decoder(&mut self) -> Self {
+        Self
+    }
+}
+
+impl Encoder for Bytes {
+    type Item = Vec<u8>;
+    type Error = Status;
+
+    fn encode(&mut self, bytes: Vec<u8>, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
+        buffer.put_slice(&bytes);
+        Ok(())
+    }
+}
+
+impl Decoder for Bytes {
+    type Item = Vec<u8>;
+    type Error = Status;
+
+    fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> Result<Option<Vec<u8>>, Status> {
+        let mut bytes = vec![0; buffer.remaining()];
+        buffer.copy_to_slice(&mut bytes);
+        Ok(Some(bytes))
     }
 }

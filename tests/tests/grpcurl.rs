@@ -2,7 +2,7 @@
 
 use std::process::{Command, Output, Stdio};
 
-use emp_tests::{TestServer, emp27, policy};
+use emp_tests::{TestServer, emp, emp27, policy};
 use serde_json::{Value, json};
 
 fn grpcurl_is_here() -> bool {
@@ -73,6 +73,10 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
         (
             "emp.v1.PolicyFrame",
             "Whether this frame starts a new episode",
+        ),
+        (
+            "emp.v1.FilterResult",
+            "is inside the support polygon; metres, negative outside",
         ),
         ("emp.v1.EvaluateConfig", "no unit, 0.1 to 10. Left out: 1"),
         (
@@ -220,5 +224,42 @@ fn grpcurl_steps_a_policy_and_evaluates() -> anyhow::Result<()> {
     assert_eq!(result["all"]["episodes"], 3);
     assert!(result["all"]["mbo"]["mean"].is_f64());
     assert!(result["recorded"].is_null());
+    Ok(())
+}
+
+#[test]
+fn grpcurl_filters_goals() -> anyhow::Result<()> {
+    if !grpcurl_is_here() {
+        return Ok(());
+    }
+    let weights = emp::weights(&emp::small(&*emp27()?, 0.2))?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let (state, goal) = state()?;
+    let observation = json!({"state": state, "goal": goal});
+    let request = json!({"robot": "emp27", "history": [observation]}).to_string();
+    let call = ["emp.v1.MotionService/FilterGoal"];
+    let answer = stdout(&grpcurl(&server, Some(&request), &call)?)?;
+    let answer: Value = serde_json::from_str(&answer)?;
+    let result = &answer["result"];
+    let length = |field: &str| result[field].as_array().map(Vec::len);
+    assert_eq!(length("executableGoal"), Some(15));
+    assert_eq!(length("change"), Some(15));
+    assert_eq!(length("nearestLinks"), Some(2));
+    assert!(result["regloss"].is_f64() && result["centerOfMassMargin"].is_f64());
+    assert_eq!(result["applied"], 1.0);
+
+    let config = json!({"config": {"robot": "emp27", "emp_mode": "EMP_MODE_ON"}});
+    let frame = json!({"frame": {"state": state, "goal": goal}});
+    let requests = [config, frame.clone(), frame]
+        .map(|message| message.to_string())
+        .join("\n");
+    let call = ["emp.v1.MotionService/StreamFilterGoal"];
+    let answers = messages(&stdout(&grpcurl(&server, Some(&requests), &call)?)?)?;
+    assert_eq!(answers.len(), 3);
+    assert_eq!(answers[0]["started"]["history"], 15);
+    assert_eq!(
+        answers[1]["result"]["result"]["executableGoal"], result["executableGoal"],
+        "a stream's first frame is a history of one"
+    );
     Ok(())
 }

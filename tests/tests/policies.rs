@@ -452,6 +452,73 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
     Ok(())
 }
 
+/// Sends bursts of which only the newest frames are computed, until a frame with `reset` was superseded, and compares
+/// each answer with a history in which that `reset` held for the next frame that was computed.
+#[tokio::test]
+async fn the_reset_of_a_superseded_frame_holds() -> anyhow::Result<()> {
+    let Fixture {
+        server,
+        controller,
+        _weights,
+    } = fixture()?;
+    let mut stream = RawStream::open(&raw_client(&server).await?).await?;
+    let config = StreamPolicyConfig {
+        delivery: Delivery::Latest.into(),
+        ..config("emp27")
+    };
+    stream.send(Request::Config(config)).await?;
+    assert!(matches!(
+        stream.next().await?,
+        Ok(Some(Response::Started(_)))
+    ));
+    let mut state = controller.state();
+    let mut frames = record(&controller)?.frames;
+    for frame in frames.iter_mut().skip(10).step_by(7) {
+        frame.reset = true;
+    }
+    let mut held = false;
+    for _burst in 0..200 {
+        for (number, frame) in (0..).zip(&frames) {
+            stream
+                .send(Request::Frame(wire_frame(number, frame)))
+                .await?;
+        }
+        let mut superseded = 0;
+        let mut results = Vec::new();
+        while superseded + results.len() < FRAMES {
+            match stream.next().await? {
+                Ok(Some(Response::Result(answered))) => {
+                    let number = answered.header.expect("a header").sequence_number;
+                    results.push((number as usize, answered.result.expect("a result")));
+                }
+                Ok(Some(Response::Dropped(dropped))) => {
+                    assert_eq!(dropped.reason(), DropReason::Superseded);
+                    superseded += 1;
+                }
+                other => panic!("{other:?}"),
+            }
+        }
+        let mut next = 0;
+        for (number, result) in results {
+            let skipped = frames[next..number].iter().any(|frame| frame.reset);
+            held |= skipped;
+            if skipped || frames[number].reset {
+                state.reset();
+            }
+            let expected = step(&controller, &mut state, &frames[number])?;
+            for (served, expected) in result.action.iter().zip(&expected.action) {
+                assert!((served - expected).abs() <= TOLERANCE);
+            }
+            next = number + 1;
+        }
+        assert_eq!(next, FRAMES, "the newest frame is always answered");
+        if held {
+            return Ok(());
+        }
+    }
+    panic!("no frame with `reset` was ever superseded")
+}
+
 #[tokio::test]
 async fn bad_configs_end_the_stream_by_field() -> anyhow::Result<()> {
     let Fixture {

@@ -1,0 +1,1004 @@
+//! Teleoperation over the wire: every role, every guard, and robots that stand meanwhile.
+
+use std::{
+    process::{Command, Stdio},
+    sync::Arc,
+    time::Duration,
+};
+
+use emp_client::{
+    ChangeReason, Client, ClientError, Delivery, EmpMode, Event, FrameSender, GoalPhase,
+    GuardReport, PoseSender, RampCause, SessionEvent, SessionEvents, StreamEvents,
+    TeleoperatedFrame, TeleoperationAnswer, TeleoperationConfig, TeleoperationFrame,
+    TeleoperationPresence,
+};
+use emp_motion::{KeyNodeFrame, key_nodes, skills};
+use emp_proto::v1::{
+    self, DropReason, FrameHeader, HumanPose, Quaternion, RobotState, TeleoperateConfig,
+    TeleoperateRequest, TeleoperateResponse, TeleoperationRole,
+    motion_service_client::MotionServiceClient, teleoperate_request::Message as Request,
+    teleoperate_response::Message as Response,
+};
+use emp_robot::Robot;
+use emp_sim::{Body, BodyParameters, Stage, Start, Targets};
+use emp_tests::{
+    TestServer, emp, emp27, fake, policy,
+    process::{ServerProcess, binaries},
+    raw, within,
+};
+use nalgebra::UnitQuaternion;
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Status, Streaming, transport::Channel};
+
+/// Control periods of a ramp of the test server.
+const RAMP: usize = 10;
+const STALE: Duration = Duration::from_millis(500);
+/// Rounding of angles, rad.
+const TOLERANCE: f32 = 1e-5;
+
+/// A server whose ramps are short, with a random policy and a random EMP.
+fn server() -> anyhow::Result<(TestServer, TempDir)> {
+    let weights = emp::weights(&emp::small(&*emp27()?, 3.0))?;
+    let server = server_with(&weights)?;
+    Ok((server, weights))
+}
+
+fn server_with(weights: &TempDir) -> anyhow::Result<TestServer> {
+    TestServer::start_with(weights.path(), |settings| {
+        settings.teleoperation.ramp_seconds = 0.2;
+        settings.teleoperation.stale_after = STALE.as_secs_f64();
+        settings.teleoperation.return_after = 2.0 * STALE.as_secs_f64();
+    })
+}
+
+/// A session's config without smoothing, so that a goal can be predicted.
+fn config(session: &str) -> TeleoperationConfig {
+    TeleoperationConfig {
+        refine: false,
+        smoothing: false,
+        ..TeleoperationConfig::new("emp27", session)
+    }
+}
+
+/// A robot that stands still, its goal joints `offset` off their default, rad.
+fn still(robot: &Robot, offset: f32) -> TeleoperationFrame {
+    let mut joint_positions: Vec<f32> = robot.joints().map(|joint| joint.default as f32).collect();
+    for angle in &mut joint_positions[..robot.goal_joints().len()] {
+        *angle += offset;
+    }
+    TeleoperationFrame {
+        pose: None,
+        joint_positions,
+        orientation: UnitQuaternion::identity(),
+        reset: false,
+        emp_mode: EmpMode::Unspecified,
+    }
+}
+
+fn measured(frame: &TeleoperationFrame) -> Vec<f32> {
+    frame.joint_positions[..15].to_vec()
+}
+
+/// A person with one arm at an angle, −0.5 to 0.5.
+fn pose(angle: f32) -> KeyNodeFrame {
+    fake::pose(angle)
+}
+
+fn assert_near(a: &[f32], b: &[f32], tolerance: f32) {
+    assert_eq!(a.len(), b.len());
+    for (a, b) in a.iter().zip(b) {
+        assert!((a - b).abs() <= tolerance, "{a} {b}");
+    }
+}
+
+/// The end of a session with the robot.
+struct RobotEnd {
+    sender: FrameSender<TeleoperationFrame>,
+    events: StreamEvents<TeleoperationAnswer>,
+}
+
+impl RobotEnd {
+    async fn join(client: &Client, session: &str) -> anyhow::Result<Self> {
+        let (sender, events) = client.join_as_robot(config(session)).await?;
+        Ok(Self { sender, events })
+    }
+
+    async fn both(client: &Client, config: TeleoperationConfig) -> anyhow::Result<Self> {
+        let (sender, events) = client.teleoperate(config).await?;
+        Ok(Self { sender, events })
+    }
+
+    async fn step(&mut self, frame: &TeleoperationFrame) -> anyhow::Result<TeleoperatedFrame> {
+        let number = self.sender.send(frame, None).await?;
+        match within("an answer", self.events.next()).await?? {
+            Some(Event::Answer(answer)) => {
+                assert_eq!(answer.sequence_number, number);
+                Ok(answer.result)
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+
+    /// Steps until the guard is in this phase.
+    async fn until(
+        &mut self,
+        frame: &TeleoperationFrame,
+        phase: GoalPhase,
+    ) -> anyhow::Result<TeleoperatedFrame> {
+        for _ in 0..1_000 {
+            let result = self.step(frame).await?;
+            if guard(&result).phase() == phase {
+                return Ok(result);
+            }
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        panic!("never {phase:?}")
+    }
+}
+
+fn guard(result: &TeleoperatedFrame) -> GuardReport {
+    result.guard.clone().expect("a guard's report")
+}
+
+fn executed(result: &TeleoperatedFrame) -> &[f32] {
+    &result
+        .filter
+        .as_ref()
+        .expect("a filter's result")
+        .executable_goal
+}
+
+/// The next event of a listener that is about this.
+async fn next<T>(
+    events: &mut SessionEvents,
+    mut wanted: impl FnMut(SessionEvent) -> Option<T>,
+) -> anyhow::Result<T> {
+    loop {
+        let event = within("an event", events.next()).await??.expect("an event");
+        if let Some(found) = wanted(event) {
+            return Ok(found);
+        }
+    }
+}
+
+async fn next_executed(events: &mut SessionEvents) -> anyhow::Result<TeleoperatedFrame> {
+    next(events, |event| match event {
+        SessionEvent::Executed(result) => Some(*result),
+        _ => None,
+    })
+    .await
+}
+
+async fn next_presence(events: &mut SessionEvents) -> anyhow::Result<TeleoperationPresence> {
+    next(events, |event| match event {
+        SessionEvent::Presence(presence) => Some(presence),
+        _ => None,
+    })
+    .await
+}
+
+async fn send(operator: &mut PoseSender, pose: &KeyNodeFrame) -> anyhow::Result<()> {
+    operator.send(pose, EmpMode::Unspecified).await?;
+    Ok(())
+}
+
+/// Sends a pose until the robot's answer has one that is fresh.
+async fn arrive(
+    operator: &mut PoseSender,
+    end: &mut RobotEnd,
+    frame: &TeleoperationFrame,
+    angle: f32,
+) -> anyhow::Result<TeleoperatedFrame> {
+    send(operator, &pose(angle)).await?;
+    for _ in 0..1_000 {
+        let result = end.step(frame).await?;
+        let phase = guard(&result).phase();
+        if matches!(phase, GoalPhase::Ramping | GoalPhase::Following) {
+            return Ok(result);
+        }
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+    panic!("the pose never arrived")
+}
+
+/// Sends a pose with every step until it is followed.
+async fn follow(
+    operator: &mut PoseSender,
+    end: &mut RobotEnd,
+    frame: &TeleoperationFrame,
+    angle: f32,
+) -> anyhow::Result<TeleoperatedFrame> {
+    for _ in 0..1_000 {
+        send(operator, &pose(angle)).await?;
+        let result = end.step(frame).await?;
+        if guard(&result).phase() == GoalPhase::Following {
+            return Ok(result);
+        }
+    }
+    panic!("the pose was never followed")
+}
+
+#[tokio::test]
+async fn one_client_with_both_ends_gets_the_whole_path() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::both(&client, config("")).await?;
+    assert_eq!(end.events.joint_names().len(), 27);
+    assert_eq!(end.events.model().0, "emp27-policy");
+    let mut frame = still(&robot, 0.05);
+    frame.pose = Some(pose(0.4));
+    let retargeted = client.retarget("emp27", &pose(0.4), false).await?;
+    let first = end.step(&frame).await?;
+    assert_near(&first.goal, &measured(&frame), TOLERANCE);
+    assert_near(executed(&first), &measured(&frame), TOLERANCE);
+    assert_eq!(guard(&first).phase(), GoalPhase::Ramping);
+    assert_eq!(guard(&first).cause(), RampCause::FirstFrame);
+    assert_eq!(first.emp_mode(), EmpMode::On);
+    let (mut last, mut periods) = (first, 1);
+    while guard(&last).phase() != GoalPhase::Following {
+        let result = end.step(&frame).await?;
+        for (index, joint) in robot.goal_joints().iter().enumerate() {
+            let step = (executed(&result)[index] - executed(&last)[index]).abs();
+            let largest = (joint.velocity_limit / robot.control_rate_hz()) as f32;
+            assert!(step <= largest + TOLERANCE, "{}: {step}", joint.name);
+        }
+        last = result;
+        periods += 1;
+    }
+    assert!(periods > RAMP);
+    assert_near(&last.goal, &retargeted.joint_angles, 1e-4);
+    let filter = last.filter.expect("a filter's result");
+    let change: Vec<f32> = last
+        .goal
+        .iter()
+        .zip(&filter.executable_goal)
+        .map(|(g, e)| e - g)
+        .collect();
+    assert_near(&filter.change, &change, TOLERANCE);
+    assert!(filter.regloss.is_some() && filter.applied == 1.0);
+    assert_eq!(filter.nearest_links.len(), 2);
+    assert_eq!((last.action.len(), last.leg_targets.len()), (12, 12));
+    let pose = last.pose.expect("a pose's report");
+    assert_near(&pose.goal, &last.goal, TOLERANCE);
+    assert_eq!(pose.header, last.header);
+    assert!(pose.timing.is_some() && pose.dropped.is_none());
+    assert!(last.timing.is_some() && last.total_time.is_some());
+    let frame = still(&robot, 0.05);
+    let without = end.step(&frame).await?;
+    assert!(
+        without.pose.is_some_and(|pose| pose.timing.is_none()),
+        "no new pose"
+    );
+    drop(end.sender);
+    assert_eq!(within("the end", end.events.next()).await??, None);
+    Ok(())
+}
+
+#[tokio::test]
+async fn an_operator_comes_leaves_and_comes_back() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let frame = still(&robot, 0.1);
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let alone = end.step(&frame).await?;
+    assert_eq!(guard(&alone).phase(), GoalPhase::Holding);
+    assert_near(&alone.goal, &measured(&frame), TOLERANCE);
+    assert!(alone.pose.is_none());
+
+    let (mut operator, mut events) = client.operate(config("lab")).await?;
+    let presence = events.started().presence.expect("who is there");
+    assert!(presence.robot && presence.operator);
+    let result = arrive(&mut operator, &mut end, &frame, 0.4).await?;
+    assert_near(&result.goal, &measured(&frame), TOLERANCE);
+    let told = next(&mut events, |event| match event {
+        SessionEvent::Executed(told) if told.header == result.header => Some(*told),
+        _ => None,
+    })
+    .await?;
+    assert_eq!(told, result, "the operator is told what the robot executes");
+    let following = follow(&mut operator, &mut end, &frame, 0.4).await?;
+    assert_ne!(following.goal, measured(&frame));
+
+    drop((operator, events));
+    let held = end.until(&frame, GoalPhase::Holding).await?;
+    assert_near(&held.goal, &following.goal, TOLERANCE);
+    let returning = end.until(&frame, GoalPhase::Returning).await?;
+    assert_near(&returning.goal, &following.goal, TOLERANCE);
+    let resting = end.until(&frame, GoalPhase::Resting).await?;
+    assert_near(&resting.goal, &measured(&still(&robot, 0.0)), TOLERANCE);
+    let age = resting.pose.and_then(|pose| pose.age).expect("an age");
+    assert!(Duration::try_from(age)? > 2 * STALE);
+
+    let (mut operator, _events) = client.operate(config("lab")).await?;
+    let back = arrive(&mut operator, &mut end, &frame, -0.4).await?;
+    assert_eq!(guard(&back).cause(), RampCause::OperatorReturned);
+    assert_near(&back.goal, &resting.goal, TOLERANCE);
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_session_waits_for_a_robot_that_left() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let (mut operator, mut events) = client.operate(config("lab")).await?;
+    assert!(
+        events
+            .started()
+            .presence
+            .is_some_and(|presence| !presence.robot)
+    );
+    for offset in [0.1, 0.2] {
+        let mut end = RobotEnd::join(&client, "lab").await?;
+        assert!(next_presence(&mut events).await?.robot);
+        let frame = still(&robot, offset);
+        let first = arrive(&mut operator, &mut end, &frame, 0.4).await?;
+        assert_eq!(guard(&first).cause(), RampCause::FirstFrame);
+        assert_near(&first.goal, &measured(&frame), TOLERANCE);
+        drop(end);
+        assert!(!next_presence(&mut events).await?.robot);
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_session_has_one_robot_and_one_operator() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let client = Client::connect(&server.url()).await?;
+    let _robot = RobotEnd::join(&client, "lab").await?;
+    let _operator = client.operate(config("lab")).await?;
+    let refused = |error: ClientError| {
+        assert_eq!(error.code(), Some(Code::AlreadyExists), "{error}");
+        assert_eq!(error.reason().as_deref(), Some("SEAT_TAKEN"));
+    };
+    refused(
+        client
+            .join_as_robot(config("lab"))
+            .await
+            .expect_err("a robot"),
+    );
+    refused(
+        client
+            .operate(config("lab"))
+            .await
+            .expect_err("an operator"),
+    );
+    refused(client.teleoperate(config("lab")).await.expect_err("both"));
+    let _another_session = RobotEnd::join(&client, "hall").await?;
+    Ok(())
+}
+
+#[tokio::test]
+async fn observers_are_told_what_the_robot_executes() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let mut observers = [
+        client.observe(config("lab")).await?,
+        client.observe(config("lab")).await?,
+    ];
+    let mut end = RobotEnd::both(&client, config("lab")).await?;
+    let mut frame = still(&robot, 0.0);
+    frame.pose = Some(pose(0.3));
+    let mut results = Vec::new();
+    for _ in 0..5 {
+        results.push(end.step(&frame).await?);
+    }
+    for observer in &mut observers {
+        for result in &results {
+            assert_eq!(&next_executed(observer).await?, result);
+        }
+    }
+    drop(end);
+    let presence = next_presence(&mut observers[0]).await?;
+    assert_eq!(
+        (presence.robot, presence.operator, presence.observers),
+        (false, false, 2)
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn sixteen_sessions_at_once_keep_apart() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let sessions = (0..16).map(|number| {
+        let (url, robot) = (server.url(), Arc::clone(&robot));
+        tokio::spawn(async move {
+            let client = Client::connect(&url).await?;
+            let session = format!("session {number}");
+            let mut end = RobotEnd::join(&client, &session).await?;
+            let (mut operator, mut events) = client.operate(config(&session)).await?;
+            let angle = 0.05 * number as f32 - 0.4;
+            let frame = still(&robot, 0.0);
+            let result = follow(&mut operator, &mut end, &frame, angle).await?;
+            let expected = client.retarget("emp27", &pose(angle), false).await?;
+            assert_near(&result.goal, &expected.joint_angles, 1e-4);
+            next(&mut events, |event| match event {
+                SessionEvent::Executed(told) => (told.header == result.header).then_some(()),
+                _ => None,
+            })
+            .await
+        })
+    });
+    for session in sessions.collect::<Vec<_>>() {
+        session.await??;
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_robot_that_was_silent_is_ramped_from_its_measured_pose() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::both(&client, config("")).await?;
+    let mut frame = still(&robot, 0.0);
+    frame.pose = Some(pose(0.4));
+    end.until(&frame, GoalPhase::Following).await?;
+    tokio::time::sleep(STALE + Duration::from_millis(100)).await;
+    let mut frame = still(&robot, 0.2);
+    frame.pose = Some(pose(0.4));
+    let resumed = end.step(&frame).await?;
+    assert_eq!(guard(&resumed).cause(), RampCause::RobotResumed);
+    assert_near(executed(&resumed), &measured(&frame), TOLERANCE);
+    end.until(&frame, GoalPhase::Following).await?;
+    frame.reset = true;
+    let reset = end.step(&frame).await?;
+    assert_eq!(guard(&reset).cause(), RampCause::FirstFrame);
+    assert_near(executed(&reset), &measured(&frame), TOLERANCE);
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_switch_of_the_emps_mode_is_blended() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let off = TeleoperationConfig {
+        emp_mode: EmpMode::Off,
+        ..config("lab")
+    };
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let (mut operator, _events) = client.operate(off).await?;
+    let frame = still(&robot, 0.0);
+    let mut last = follow(&mut operator, &mut end, &frame, 0.3).await?;
+    assert_eq!(last.emp_mode(), EmpMode::Off);
+    assert_near(executed(&last), &last.goal, TOLERANCE);
+    // The operator switches it on, the robot off again.
+    operator.send(&pose(0.3), EmpMode::On).await?;
+    while last.emp_mode() != EmpMode::On {
+        send(&mut operator, &pose(0.3)).await?;
+        let result = end.step(&frame).await?;
+        if result.emp_mode() == EmpMode::On {
+            assert_near(executed(&result), executed(&last), TOLERANCE);
+            assert_eq!(guard(&result).emp_progress, Some(0.0));
+        }
+        last = result;
+    }
+    let mut periods = 1;
+    while guard(&last).emp_progress.is_some() {
+        send(&mut operator, &pose(0.3)).await?;
+        last = end.step(&frame).await?;
+        periods += 1;
+    }
+    assert!(periods > RAMP);
+    let corrected = last.filter.clone().expect("a filter's result");
+    assert!(corrected.change.iter().any(|change| change.abs() > 0.01));
+    let switch = TeleoperationFrame {
+        emp_mode: EmpMode::Off,
+        ..frame.clone()
+    };
+    send(&mut operator, &pose(0.3)).await?;
+    let result = end.step(&switch).await?;
+    assert_eq!(result.emp_mode(), EmpMode::Off);
+    assert_eq!(guard(&result).emp_progress, Some(0.0));
+    assert_near(executed(&result), &corrected.executable_goal, 0.02);
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_jump_of_the_pose_is_limited_in_speed() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let off = TeleoperationConfig {
+        emp_mode: EmpMode::Off,
+        ..config("")
+    };
+    let mut end = RobotEnd::both(&client, off).await?;
+    let mut frame = still(&robot, 0.0);
+    frame.pose = Some(pose(-0.5));
+    let before = end.until(&frame, GoalPhase::Following).await?;
+    frame.pose = Some(pose(0.5));
+    let jump = end.step(&frame).await?;
+    assert_eq!(guard(&jump).phase(), GoalPhase::Following);
+    let limited = guard(&jump).speed_limited_joints;
+    assert!(!limited.is_empty());
+    let filter = jump.filter.clone().expect("a filter's result");
+    assert!(filter.reasons().any(|reason| reason == ChangeReason::Speed));
+    for (index, joint) in robot.goal_joints().iter().enumerate() {
+        let step = (executed(&jump)[index] - executed(&before)[index]).abs();
+        let largest = (joint.velocity_limit / robot.control_rate_hz()) as f32;
+        assert!(step <= largest + TOLERANCE);
+        assert_eq!(
+            limited.contains(&joint.name),
+            executed(&jump)[index] != jump.goal[index]
+        );
+    }
+    Ok(())
+}
+
+/// A stream as any gRPC client would open it.
+struct RawStream {
+    requests: Option<mpsc::Sender<TeleoperateRequest>>,
+    responses: Streaming<TeleoperateResponse>,
+}
+
+impl RawStream {
+    async fn open(server: &TestServer, config: TeleoperateConfig) -> anyhow::Result<Self> {
+        let mut client: MotionServiceClient<Channel> =
+            MotionServiceClient::connect(server.url()).await?;
+        let (requests, outbound) = mpsc::channel(64);
+        let config = Request::Config(config);
+        let message = Some(config);
+        requests.send(TeleoperateRequest { message }).await?;
+        let call = client.teleoperate(ReceiverStream::new(outbound));
+        let responses = within("the headers", call).await??.into_inner();
+        Ok(Self {
+            requests: Some(requests),
+            responses,
+        })
+    }
+
+    async fn send(&self, number: u64, mut frame: v1::TeleoperationFrame) -> anyhow::Result<()> {
+        let mut header = frame.header.unwrap_or_default();
+        header.sequence_number = number;
+        frame.header = Some(header);
+        let message = Some(Request::Frame(frame));
+        let requests = self.requests.as_ref().expect("an open stream");
+        Ok(requests.send(TeleoperateRequest { message }).await?)
+    }
+
+    async fn next(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
+        let response = within("a message", self.responses.message()).await?;
+        Ok(response.map(|response| response.and_then(|response| response.message)))
+    }
+
+    async fn started(&mut self) -> anyhow::Result<()> {
+        assert!(matches!(self.next().await?, Ok(Some(Response::Started(_)))));
+        Ok(())
+    }
+}
+
+fn raw_config(session: &str, role: TeleoperationRole) -> TeleoperateConfig {
+    TeleoperateConfig {
+        session: session.to_owned(),
+        role: role.into(),
+        robot: "emp27".to_owned(),
+        ..TeleoperateConfig::default()
+    }
+}
+
+fn raw_state(frame: &TeleoperationFrame) -> RobotState {
+    let q = frame.orientation.cast::<f32>();
+    RobotState {
+        joint_positions: frame.joint_positions.clone(),
+        base_orientation: Some(Quaternion {
+            w: q.w,
+            x: q.i,
+            y: q.j,
+            z: q.k,
+        }),
+    }
+}
+
+fn frame_of(pose: Option<HumanPose>, state: Option<RobotState>) -> v1::TeleoperationFrame {
+    v1::TeleoperationFrame {
+        pose,
+        state,
+        ..v1::TeleoperationFrame::default()
+    }
+}
+
+#[tokio::test]
+async fn a_bad_config_is_refused_by_name() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let server = server_with(&weights)?;
+    let bad: [(&str, &dyn Fn(&mut TeleoperateConfig)); 8] = [
+        ("config.role", &|config| config.role = 9),
+        ("config.session", &|config| config.session.clear()),
+        ("config.session", &|config| config.session = "x".repeat(65)),
+        ("config.delivery", &|config| config.delivery = 9),
+        ("config.emp_mode", &|config| config.emp_mode = 9),
+        ("config.emp_mode", &|config| {
+            config.emp_mode = EmpMode::On.into()
+        }),
+        ("robot", &|config| config.robot = "nobody".to_owned()),
+        ("model", &|config| config.retargeter = "nothing".to_owned()),
+    ];
+    for (field, change) in bad {
+        let mut config = raw_config("lab", TeleoperationRole::Robot);
+        change(&mut config);
+        let mut stream = RawStream::open(&server, config).await?;
+        let status = stream.next().await?.expect_err("refused");
+        assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
+        assert!(status.message().starts_with(field), "{field}: {status:?}");
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let server = server_with(&weights)?;
+    let good = still(&*emp27()?, 0.0);
+    let person = || Some(raw::pose(&pose(0.3)));
+    let with_state = |change: &dyn Fn(&mut RobotState)| {
+        let mut state = raw_state(&good);
+        change(&mut state);
+        frame_of(None, Some(state))
+    };
+    let broken_pose = || {
+        let mut pose = raw::pose(&pose(0.3));
+        pose.left_elbow.as_mut().expect("an elbow").x = f32::NAN;
+        Some(pose)
+    };
+    let mode = |frame: v1::TeleoperationFrame| v1::TeleoperationFrame {
+        emp_mode: EmpMode::On.into(),
+        ..frame
+    };
+    let robots = vec![
+        ("state", frame_of(None, None)),
+        ("pose", frame_of(person(), Some(raw_state(&good)))),
+        (
+            "state.joint_positions",
+            with_state(&|state| state.joint_positions.truncate(26)),
+        ),
+        (
+            "state.joint_positions[2]",
+            with_state(&|state| state.joint_positions[2] = f32::NAN),
+        ),
+        (
+            "state.base_orientation",
+            with_state(&|state| state.base_orientation = None),
+        ),
+        ("emp_mode", mode(frame_of(None, Some(raw_state(&good))))),
+    ];
+    let operators = vec![
+        ("pose", frame_of(None, None)),
+        ("state", frame_of(person(), Some(raw_state(&good)))),
+        ("pose.left_elbow.x", frame_of(broken_pose(), None)),
+        ("emp_mode", mode(frame_of(person(), None))),
+    ];
+    let both = vec![
+        ("state", frame_of(person(), None)),
+        (
+            "pose.left_elbow.x",
+            frame_of(broken_pose(), Some(raw_state(&good))),
+        ),
+    ];
+    let observers = vec![("frame", frame_of(person(), None))];
+    for (role, frames) in [
+        (TeleoperationRole::Robot, robots),
+        (TeleoperationRole::Operator, operators),
+        (TeleoperationRole::Both, both),
+        (TeleoperationRole::Observer, observers),
+    ] {
+        let mut stream = RawStream::open(&server, raw_config("lab", role)).await?;
+        stream.started().await?;
+        for (number, (field, frame)) in frames.into_iter().enumerate() {
+            stream.send(number as u64, frame).await?;
+            let Ok(Some(Response::Dropped(dropped))) = stream.next().await? else {
+                panic!("{role:?}: {field} is not refused")
+            };
+            assert_eq!(
+                (dropped.reason(), dropped.field.as_str()),
+                (DropReason::Invalid, field)
+            );
+            assert_eq!(
+                dropped.header.unwrap_or_default().sequence_number,
+                number as u64
+            );
+        }
+        if matches!(role, TeleoperationRole::Robot | TeleoperationRole::Both) {
+            stream
+                .send(99, frame_of(None, Some(raw_state(&good))))
+                .await?;
+            let answer = stream.next().await?;
+            assert!(
+                matches!(answer, Ok(Some(Response::Result(_)))),
+                "{answer:?}"
+            );
+        }
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_pose_that_cannot_be_retargeted_in_time_is_not_used() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let server = server_with(&weights)?;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let mut operator =
+        RawStream::open(&server, raw_config("lab", TeleoperationRole::Operator)).await?;
+    operator.started().await?;
+    let late = v1::TeleoperationFrame {
+        header: Some(FrameHeader {
+            time_budget: Some(prost_types::Duration::default()),
+            ..FrameHeader::default()
+        }),
+        ..frame_of(Some(raw::pose(&pose(0.3))), None)
+    };
+    operator.send(7, late).await?;
+    let frame = still(&*emp27()?, 0.0);
+    loop {
+        let result = end.step(&frame).await?;
+        let Some(pose) = result.pose else {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+            continue;
+        };
+        let dropped = pose.dropped.expect("it was too late");
+        assert_eq!(dropped.reason(), DropReason::DeadlineExceeded);
+        assert_eq!(dropped.header.unwrap_or_default().sequence_number, 7);
+        assert!(pose.goal.is_empty());
+        assert_eq!(
+            result.leg_targets.len(),
+            12,
+            "the robot is told what to do all the same"
+        );
+        return Ok(());
+    }
+}
+
+#[tokio::test]
+async fn with_latest_every_frame_is_answered_or_superseded() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let frame = still(&*emp27()?, 0.0);
+    let config = TeleoperateConfig {
+        delivery: Delivery::Latest.into(),
+        ..raw_config("lab", TeleoperationRole::Robot)
+    };
+    let mut stream = RawStream::open(&server, config).await?;
+    stream.started().await?;
+    for number in 0..40 {
+        stream
+            .send(number, frame_of(None, Some(raw_state(&frame))))
+            .await?;
+    }
+    stream.requests = None;
+    let (mut seen, mut last) = (Vec::new(), None);
+    while let Some(message) = stream.next().await?? {
+        let header = match message {
+            Response::Result(result) => {
+                last = result.header;
+                result.header
+            }
+            Response::Dropped(dropped) => {
+                assert_eq!(dropped.reason(), DropReason::Superseded);
+                dropped.header
+            }
+            other => panic!("{other:?}"),
+        };
+        seen.push(header.unwrap_or_default().sequence_number);
+    }
+    assert_eq!(
+        last.map(|header| header.sequence_number),
+        Some(39),
+        "the newest is computed"
+    );
+    seen.sort_unstable();
+    assert_eq!(seen, (0..40).collect::<Vec<u64>>());
+    Ok(())
+}
+
+#[tokio::test]
+async fn an_observer_who_half_closed_still_hears() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let mut observer =
+        RawStream::open(&server, raw_config("lab", TeleoperationRole::Observer)).await?;
+    observer.started().await?;
+    observer.requests = None;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let presence = observer.next().await?;
+    assert!(matches!(presence, Ok(Some(Response::Presence(presence))) if presence.robot));
+    let result = end.step(&still(&*emp27()?, 0.0)).await?;
+    assert_eq!(
+        observer.next().await?.map_err(|status| status.to_string()),
+        Ok(Some(Response::Result(result)))
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_server_that_drains_ends_every_end() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let frame = still(&*emp27()?, 0.0);
+    let mut streams = Vec::new();
+    for role in [
+        TeleoperationRole::Robot,
+        TeleoperationRole::Operator,
+        TeleoperationRole::Observer,
+    ] {
+        let mut stream = RawStream::open(&server, raw_config("lab", role)).await?;
+        stream.started().await?;
+        streams.push(stream);
+    }
+    streams[0]
+        .send(0, frame_of(None, Some(raw_state(&frame))))
+        .await?;
+    let answer = loop {
+        match streams[0].next().await? {
+            Ok(Some(Response::Result(result))) => break result,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(answer.leg_targets.len(), 12);
+    server.begin_shutdown();
+    for stream in &mut streams {
+        let status = loop {
+            match stream.next().await? {
+                Ok(Some(_)) => {}
+                Ok(None) => panic!("it ended without a reason"),
+                Err(status) => break status,
+            }
+        };
+        assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+    }
+    drop(streams);
+    assert_eq!(server.ended().await?, emp_server::Drain::Complete);
+    Ok(())
+}
+
+/// A robot in MuJoCo at its end of a session.
+struct Simulated {
+    stage: Stage,
+    body: Body,
+}
+
+impl Simulated {
+    fn new(robot: &Robot) -> anyhow::Result<Self> {
+        let mut stage = Stage::new(robot)?;
+        let default: Vec<f64> = robot.joints().map(|joint| joint.default).collect();
+        let body = stage.place(&Start {
+            joint_positions: &default,
+            lift: 0.0,
+            parameters: BodyParameters::default(),
+        });
+        Ok(Self { stage, body })
+    }
+
+    fn frame(&self) -> TeleoperationFrame {
+        let reading = self.body.reading();
+        TeleoperationFrame {
+            pose: None,
+            joint_positions: reading.joint_positions.clone(),
+            orientation: reading.orientation,
+            reset: false,
+            emp_mode: EmpMode::Unspecified,
+        }
+    }
+
+    fn execute(&mut self, result: &TeleoperatedFrame) {
+        let targets = Targets {
+            goal: executed(result),
+            legs: &result.leg_targets,
+        };
+        self.stage.step(&mut self.body, &targets);
+    }
+
+    /// Cosine of the base's tilt.
+    fn upright(&self) -> f64 {
+        let down = self.body.reading().orientation.inverse() * nalgebra::Vector3::z();
+        down.z
+    }
+}
+
+/// `emp operate` or `emp observe` as a process of its own.
+fn emp_command(server: &str, arguments: &[&str]) -> anyhow::Result<Command> {
+    let mut command = Command::new(binaries()?.join("emp"));
+    command
+        .args(["--server", server])
+        .args(arguments)
+        .args(["--robot", "emp27", "--session", "lab", "--json"])
+        .stdout(Stdio::piped());
+    Ok(command)
+}
+
+#[tokio::test]
+async fn a_robot_stands_while_operators_in_other_processes_come_and_go() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let server = ServerProcess::start(folder.path())?;
+    let motion = folder.path().join("wave.npz");
+    let mut clip = skills::generate(skills::Skill::Wave, 3).resampled(50.0);
+    clip.frames.truncate(125);
+    key_nodes::write(&motion, &clip)?;
+    let motion = motion.to_string_lossy().into_owned();
+
+    let robot = emp27()?;
+    let client = Client::connect(&server.url).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let mut simulated = Simulated::new(&robot)?;
+    let mut ticks = tokio::time::interval(Duration::from_millis(20));
+    let observer = emp_command(&server.url, &["observe", "--seconds", "4"])?.spawn()?;
+    let mut phases = Vec::new();
+    for _ in 0..2 {
+        let mut operator = emp_command(&server.url, &["operate", &motion])?.spawn()?;
+        let mut after = 0;
+        // A second after the operator has gone, the next one comes.
+        while after < 50 {
+            ticks.tick().await;
+            let result = end.step(&simulated.frame()).await?;
+            simulated.execute(&result);
+            assert!(simulated.upright() > 0.9, "the robot tilts");
+            phases.push(guard(&result).phase());
+            after += usize::from(operator.try_wait()?.is_some());
+        }
+        let output = operator.wait_with_output()?;
+        assert!(output.status.success());
+        let summary: Value = serde_json::from_slice(&output.stdout)?;
+        assert!(
+            summary["executed"].as_u64().is_some_and(|count| count > 60),
+            "{summary}"
+        );
+        assert!(
+            summary["phases"]["following"]
+                .as_u64()
+                .is_some_and(|count| count > 0),
+            "{summary}"
+        );
+    }
+    let count = |wanted| phases.iter().filter(|phase| **phase == wanted).count();
+    assert!(count(GoalPhase::Following) > 60, "{phases:?}");
+    assert!(count(GoalPhase::Holding) > 0, "{phases:?}");
+    let observed = tokio::task::spawn_blocking(move || observer.wait_with_output()).await??;
+    assert!(observed.status.success());
+    let lines: Vec<Value> = observed
+        .stdout
+        .split(|byte| *byte == b'\n')
+        .filter(|line| !line.is_empty())
+        .map(serde_json::from_slice)
+        .collect::<Result<_, _>>()?;
+    assert!(lines.len() > 60, "{} lines", lines.len());
+    assert!(lines.iter().any(|line| line["phase"] == "ramping"));
+    Ok(())
+}
+
+#[tokio::test]
+async fn the_command_prints_a_table_for_people() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let server = ServerProcess::start(folder.path())?;
+    let client = Client::connect(&server.url).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let observer = Command::new(binaries()?.join("emp"))
+        .args([
+            "--server",
+            &server.url,
+            "observe",
+            "--robot",
+            "emp27",
+            "--session",
+            "lab",
+        ])
+        .args(["--seconds", "1.5"])
+        .stdout(Stdio::piped())
+        .spawn()?;
+    let frame = still(&*emp27()?, 0.0);
+    for _ in 0..100 {
+        end.step(&frame).await?;
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let output = tokio::task::spawn_blocking(move || observer.wait_with_output()).await??;
+    assert!(output.status.success());
+    let table = String::from_utf8(output.stdout)?;
+    assert!(table.starts_with("frame "), "{table}");
+    assert!(table.contains("holding"), "{table}");
+    Ok(())
+}

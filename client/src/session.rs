@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, process::ExitCode, time::Duration};
 
 use anyhow::Context as _;
 use emp_client::{
-    Client, ClientError, EmpMode, GoalPhase, GuardReport, PoseSender, SessionEvent, SessionEvents,
+    Client, EmpMode, GoalPhase, GuardReport, PoseSender, SessionEvent, SessionEvents,
     TeleoperatedFrame, TeleoperationConfig, TeleoperationPresence,
 };
 use emp_motion::Clip;
@@ -102,7 +102,7 @@ async fn listen(
             Ok(Some(SessionEvent::Executed(result))) => executed(&result),
             Ok(Some(event)) => say(&event),
             Ok(None) => return Ok(ExitCode::SUCCESS),
-            Err(error) => return Err(ClientError::into(error)),
+            Err(error) => return Err(error.into()),
         }
     }
 }

@@ -93,7 +93,7 @@ fn a_policy_resumes_bit_for_bit_at_any_number_of_threads() {
 }
 
 /// A small EMP run; an evaluation would write weights before it is killed.
-const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_up=8 \
+const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_up=8 --set hindsight.frames=4 \
                    --set procedural_clips=2 --set evaluation_clips=1 --set optimizer.rows=64 \
                    --set evaluate_every=1000000";
 

@@ -1,7 +1,8 @@
 //! The learner of an EMP: from one rollout to the next weights.
 //!
 //! The loss is the paper's weighted sum of six, through imagined control periods where the settings ask for them, plus the
-//! price of falls (see [`RiskSettings`](super::settings::RiskSettings)). Each mini-batch is cut into a fixed number of shards whose
+//! lesson of falls (see [`HindsightSettings`](super::settings::HindsightSettings)) and the price of contacts and falls (see
+//! [`RiskSettings`](super::settings::RiskSettings)). Each mini-batch is cut into a fixed number of shards whose
 //! gradients are added in order, so the weights have the same bits at any number of threads.
 
 use std::{sync::Arc, time::Instant};
@@ -48,6 +49,7 @@ const RESIDUAL_GAIN: f64 = 0.01;
 /// Names in a checkpoint.
 const EMP: &str = "emp";
 const CRITIC: &str = "critic";
+const AVERAGE: &str = "average";
 const PRIVILEGED: &str = "moments.privileged";
 const NORMALIZER: &str = "emp-normalizer";
 
@@ -59,8 +61,12 @@ pub struct Learner {
     normalizer: Normalizer,
     vars: VarMap,
     adam: Adam,
+    /// Running mean of the EMP's weights.
+    average: Tensors,
     critic: Critic,
     objective: Objective,
+    /// Angles of the goal joints in the default pose, rad.
+    default_pose: Vec<f32>,
     reference: [f64; 2],
     progress: Progress,
 }
@@ -87,6 +93,8 @@ pub struct Progress {
 pub struct UpdateStatistics {
     /// Means of the six losses, in the order of [`Terms::NAMES`](super::objective::Terms::NAMES).
     pub terms: [f64; 6],
+    /// Mean weighted loss of hindsight.
+    pub hindsight: f64,
     /// Mean weighted surrogate of the risk.
     pub risk: f64,
     /// Share of the returns' variance that the critic explains.
@@ -154,12 +162,18 @@ impl Learner {
             },
             settings: settings.clone(),
             layout,
+            average: variables::values(&vars)?,
             network,
             normalizer,
             vars,
             adam,
             critic,
             objective,
+            default_pose: robot
+                .goal_joints()
+                .iter()
+                .map(|joint| joint.default as f32)
+                .collect(),
             reference: warm_up.reference,
         })
     }
@@ -167,6 +181,11 @@ impl Learner {
     /// The EMP as it is now; its tensors follow the learner.
     pub fn network(&self) -> &EmpNetwork {
         &self.network
+    }
+
+    /// The weights to serve, named as [`EmpNetwork::new`] names them: a running mean of those after each rollout.
+    pub fn average(&self) -> &Tensors {
+        &self.average
     }
 
     /// The normalisation of the EMP's features.
@@ -200,6 +219,9 @@ impl Learner {
         for (name, tensor) in self.normalizer.tensors()? {
             tensors.insert(format!("{NORMALIZER}/{name}"), tensor);
         }
+        for (name, tensor) in &self.average {
+            tensors.insert(format!("{AVERAGE}/{name}"), tensor.clone());
+        }
         self.critic.moments.save(PRIVILEGED, &mut tensors)?;
         Ok(tensors)
     }
@@ -223,6 +245,7 @@ impl Learner {
         variables::restore(&self.critic.vars, &critic)?;
         self.critic.adam.restore(&critic, progress.critic_steps)?;
         self.critic.moments.restore(PRIVILEGED, tensors)?;
+        self.average = part(AVERAGE);
         let config = self.network.config().clone();
         self.normalizer = Normalizer::from_tensors(&part(NORMALIZER), config.features())
             .map_err(anyhow::Error::msg)?;
@@ -262,6 +285,7 @@ impl Learner {
             self.step(rollout, &batch, &rows, imagination, threads, &mut sums)
                 .with_context(|| format!("rollout {}, update {update}", self.progress.updates))?;
         }
+        self.follow()?;
         let newest = rollout.privileged.len() - self.critic.moments.width() * rollout.environments;
         self.critic.moments.update(&rollout.privileged[newest..]);
         self.progress.updates += 1;
@@ -270,13 +294,34 @@ impl Learner {
         Ok(sums.statistics(&batch, self.progress.learning_rate, start))
     }
 
+    /// Lets the running mean of the weights follow them.
+    fn follow(&mut self) -> Result<()> {
+        let kept = self.settings.optimizer.averaging;
+        for (name, value) in variables::values(&self.vars)? {
+            if let Some(average) = self.average.get_mut(&name) {
+                *average = ((&*average * kept)? + (value * (1.0 - kept))?)?;
+            }
+        }
+        Ok(())
+    }
+
     /// Works out what is to be learnt from a rollout.
     fn batch(&self, rollout: &Rollout, threads: &rayon::ThreadPool) -> Result<Batch> {
-        let usable = usable_rows(rollout, self.settings.horizon);
+        let mut usable = usable_rows(rollout, self.settings.horizon);
+        let hindsight = &self.settings.hindsight;
+        let mut lessons = vec![false; rollout.rows()];
+        if hindsight.weight > 0.0 {
+            let foreseen = rollout.foreseen(hindsight.frames);
+            usable.retain(|row| foreseen[*row]);
+            let before_fall =
+                |periods: Option<usize>| periods.is_some_and(|n| n < hindsight.frames);
+            lessons = rollout.until_fall().into_iter().map(before_fall).collect();
+        }
         let risk = &self.settings.risk;
         if risk.weight == 0.0 {
             return Ok(Batch {
                 usable,
+                lessons,
                 ..Batch::default()
             });
         }
@@ -310,6 +355,7 @@ impl Learner {
         let (samples, means) = (&rollout.samples, &rollout.means);
         Ok(Batch {
             usable,
+            lessons,
             log_probabilities: ppo::log_probabilities(
                 &tensor(samples, joints)?,
                 &tensor(means, joints)?,
@@ -390,6 +436,9 @@ impl Learner {
         };
         let terms = self.objective.terms(&moments, &steps)?;
         let mut loss = (terms.total(&self.settings.losses.weights)? * share)?;
+        let hindsight = self.hindsight(rollout, batch, rows, &steps[0].goal)?;
+        let lesson = f64::from(hindsight.to_scalar::<f32>()?) / total as f64;
+        loss = (loss + (hindsight / total as f64)?)?;
         let (mut surrogate, mut divergence) = (0.0, 0.0);
         if self.settings.risk.weight > 0.0 {
             let risk = self.risk(rollout, batch, rows, &steps[0].goal)?;
@@ -400,6 +449,7 @@ impl Learner {
         Ok(Shard {
             gradient: loss.backward()?,
             terms: terms.means()?.map(|mean| mean * share),
+            hindsight: lesson,
             risk: surrogate,
             divergence,
         })
@@ -456,6 +506,31 @@ impl Learner {
             joint_positions: newest(layout.joint_positions())?,
             orientation: newest(layout.orientation())?,
         })
+    }
+
+    /// The weighted loss of hindsight, summed over the rows: distance from the goals that should have been asked for.
+    fn hindsight(
+        &self,
+        rollout: &Rollout,
+        batch: &Batch,
+        rows: &[usize],
+        answers: &Tensor,
+    ) -> candle_core::Result<Tensor> {
+        let settings = &self.settings.hindsight;
+        let joints = self.layout.goal().len();
+        let weight = |&row: &usize| {
+            if batch.lessons[row] {
+                settings.weight as f32
+            } else {
+                0.0
+            }
+        };
+        let weights: Vec<f32> = rows.iter().map(weight).collect();
+        let default = Tensor::new(self.default_pose.as_slice(), &Device::Cpu)?;
+        let distances = gathered(&rollout.goals, joints, rows)?.broadcast_sub(&default)?;
+        let wiser = (distances * settings.amplitude)?.broadcast_add(&default)?;
+        let errors = (answers - wiser)?.sqr()?.sum(1)?;
+        (errors * Tensor::from_vec(weights, rows.len(), &Device::Cpu)?)?.sum_all()
     }
 
     /// The surrogate of the expected cost, and the critic's error.
@@ -573,8 +648,10 @@ impl Critic {
 /// What is to be learnt from a rollout; without risk only the rows.
 #[derive(Default)]
 struct Batch {
-    /// Rows from which the horizon can be imagined.
+    /// Rows from which the horizon can be imagined, and whose future is known as far as hindsight goes.
     usable: Vec<usize>,
+    /// Whether a fall follows a row so soon that hindsight counts.
+    lessons: Vec<bool>,
     log_probabilities: Vec<f32>,
     advantages: Vec<f32>,
     returns: Vec<f32>,
@@ -595,6 +672,7 @@ struct Risk {
 struct Shard {
     gradient: GradStore,
     terms: [f64; 6],
+    hindsight: f64,
     risk: f64,
     divergence: f64,
 }
@@ -604,6 +682,7 @@ struct Shard {
 struct Sums {
     batches: f64,
     terms: [f64; 6],
+    hindsight: f64,
     risk: f64,
     divergence: f64,
     gradient_norm: f64,
@@ -614,6 +693,7 @@ impl Sums {
         self.batches += 1.0;
         self.divergence += divergence;
         for shard in shards {
+            self.hindsight += shard.hindsight;
             self.risk += shard.risk;
             for (sum, term) in self.terms.iter_mut().zip(shard.terms) {
                 *sum += term;
@@ -624,6 +704,7 @@ impl Sums {
     fn statistics(&self, batch: &Batch, learning_rate: f64, start: Instant) -> UpdateStatistics {
         UpdateStatistics {
             terms: self.terms.map(|sum| sum / self.batches),
+            hindsight: self.hindsight / self.batches,
             risk: self.risk / self.batches,
             explained_variance: batch.explained_variance,
             divergence: self.divergence / self.batches,

@@ -99,7 +99,7 @@ impl Cost<'_> {
         sums.centroid += centroid;
         sums.contact += contact;
         let settings = self.settings;
-        (fall
+        (settings.fall * fall
             + settings.orientation * orientation
             + settings.centroid * centroid
             + settings.contact * contact / 100.0) as f32
@@ -306,6 +306,35 @@ impl Rollout {
         self.ends.len()
     }
 
+    /// How many control periods after each row the robot falls, 0 for the row of the fall itself; none where it does not within
+    /// the episode, and within the rollout.
+    pub fn until_fall(&self) -> Vec<Option<usize>> {
+        let mut until = vec![None; self.rows()];
+        for row in (0..self.rows()).rev() {
+            until[row] = match self.ends[row] {
+                End::Terminated => Some(0),
+                End::None => {
+                    let next = until.get(row + self.environments).copied().flatten();
+                    next.map(|periods| periods + 1)
+                }
+                End::TimedOut | End::Diverged => None,
+            };
+        }
+        until
+    }
+
+    /// Rows of which it is known what follows in the next `periods` control periods, or to the episode's end.
+    pub fn foreseen(&self, periods: usize) -> Vec<bool> {
+        let n = self.environments;
+        let mut ends = vec![false; self.rows()];
+        for row in (0..self.rows()).rev() {
+            let later = ends.get(row + n).copied().unwrap_or(false);
+            ends[row] = self.ends[row] != End::None || later;
+        }
+        let rows = (0..self.rows()).map(|row| ends[row] || row + periods * n < self.rows());
+        rows.collect()
+    }
+
     /// Number of episodes that ended.
     pub fn episodes(&self) -> usize {
         self.ends.iter().filter(|end| **end != End::None).count()
@@ -363,4 +392,28 @@ fn inside(goals: &[f32], ranges: &[[f32; 2]]) -> Vec<f32> {
     angles
         .map(|(angle, [lower, upper])| angle.clamp(*lower, *upper))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_follows_a_row_is_known_within_its_episode_and_the_rollout() {
+        // Two environments, four periods: the first falls in the third, the second's episode times out in the second.
+        let mut rollout = Rollout {
+            environments: 2,
+            ..Rollout::default()
+        };
+        rollout.ends = vec![End::None; 8];
+        rollout.ends[4] = End::Terminated;
+        rollout.ends[3] = End::TimedOut;
+        let until = rollout.until_fall();
+        let expected = [Some(2), None, Some(1), None, Some(0), None, None, None];
+        assert_eq!(until, expected);
+        let foreseen = rollout.foreseen(2);
+        // Two periods on, the rows of the last two periods are beyond the rollout, but for the episode that ends.
+        let expected = [true, true, true, true, true, false, false, false];
+        assert_eq!(foreseen, expected);
+    }
 }

@@ -46,7 +46,9 @@ pub struct Settings {
     pub wm_loss_steps: usize,
     /// How the world model learns, where anything is imagined.
     pub world_model: WorldModelSettings,
-    /// What falls cost, learnt from real rollouts.
+    /// What should have been asked for before a fall.
+    pub hindsight: HindsightSettings,
+    /// What contacts and falls cost, learnt from real rollouts.
     pub risk: RiskSettings,
     /// Steps of the optimiser.
     pub optimizer: OptimizerSettings,
@@ -122,14 +124,29 @@ pub struct WorldModelSettings {
     pub learner: LearnerSettings,
 }
 
+/// The lesson of falls. Once the robot has fallen, it is known of every moment of the last second or two that its goal should have
+/// been nearer the default pose. Where such moments look like others that end well, the EMP answers between the two.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HindsightSettings {
+    /// Weight of ‖ĝ − (g₀ + amplitude · (g − g₀))‖² in the moments before a fall, g₀ the default pose. 0: no such loss.
+    pub weight: f64,
+    /// Control periods before a fall that count.
+    pub frames: usize,
+    /// Share of the distance from the default pose that should have been asked for.
+    pub amplitude: f64,
+}
+
 /// The price of falls and of what leads to them. One imagined period cannot see a fall that builds up over a second, and the
 /// simulator has no gradient; so the gradient of the expected cost of what really follows is estimated from rollouts with
 /// explored goals, by proximal policy optimisation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RiskSettings {
-    /// Weight of the expected cost beside the six losses; a fall costs 1. 0: no exploration, no risk term.
+    /// Weight of the expected cost beside the six losses. 0: no exploration, no risk term.
     pub weight: f64,
+    /// Cost of a fall.
+    pub fall: f64,
     /// Cost of one period of `L_ori`, of the measured base.
     pub orientation: f64,
     /// Cost of one period of `L_cen`, where it is positive: of the measured centre of mass away from the policy's operating
@@ -171,6 +188,8 @@ pub struct OptimizerSettings {
     pub learning_rate: [f64; 2],
     /// Bound of the gradient's norm.
     pub max_gradient_norm: f64,
+    /// What is served is a running mean of the weights: after each rollout it keeps this share of itself. 0: the last weights.
+    pub averaging: f64,
 }
 
 impl Settings {
@@ -208,8 +227,14 @@ impl Settings {
                 learning_rate: 5e-4,
                 learner: LearnerSettings::default(),
             },
+            hindsight: HindsightSettings {
+                weight: 0.0,
+                frames: 100,
+                amplitude: 0.4,
+            },
             risk: RiskSettings {
                 weight: 0.0,
+                fall: 1.0,
                 orientation: 0.05,
                 centroid: 0.0,
                 contact: 0.01,
@@ -228,6 +253,7 @@ impl Settings {
                 shards: 4,
                 learning_rate: [1e-4, 1e-4],
                 max_gradient_norm: 10.0,
+                averaging: 0.0,
             },
             episodes: TrackingSettings::default(),
             live: 0.25,
@@ -241,6 +267,7 @@ impl Settings {
         let paper = Self::paper();
         Self {
             environments: 256,
+            frames: 200,
             network: NetworkSettings {
                 differences: true,
                 output: Output::Residual,
@@ -265,18 +292,26 @@ impl Settings {
                 cen_ref: CenRef::Measured,
             },
             horizon: 0,
+            hindsight: HindsightSettings {
+                weight: 80.0,
+                ..paper.hindsight
+            },
             risk: RiskSettings {
                 weight: 1000.0,
-                orientation: 0.1,
-                contact: 0.005,
+                fall: 0.0,
+                orientation: 0.0,
+                contact: 0.004,
+                std: 0.02,
+                target_divergence: 0.03,
                 ..paper.risk.clone()
             },
             optimizer: OptimizerSettings {
-                updates: 12,
+                updates: 60,
                 rows: 2048,
                 shards: 4,
-                learning_rate: [5e-5, 1e-3],
+                learning_rate: [1.5e-4, 1e-3],
                 max_gradient_norm: 10.0,
+                averaging: 0.9,
             },
             ..paper
         }
@@ -333,6 +368,20 @@ impl Settings {
                 let frames = self.frames;
                 bail!("setting `{name}` is {steps}, expected at most `frames`, {frames}");
             }
+        }
+        let averaging = self.optimizer.averaging;
+        if !(0.0..1.0).contains(&averaging) {
+            bail!(
+                "setting `optimizer.averaging` is {averaging}, expected 0 or more and less than 1"
+            );
+        }
+        let hindsight = &self.hindsight;
+        if hindsight.weight > 0.0 && !(1..self.frames).contains(&hindsight.frames) {
+            bail!(
+                "setting `hindsight.frames` is {}, expected 1 or more and less than `frames`, {}",
+                hindsight.frames,
+                self.frames
+            );
         }
         if !(0.0..=1.0).contains(&self.live) {
             bail!(

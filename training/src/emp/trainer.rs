@@ -39,8 +39,9 @@ const ENVIRONMENTS: &str = "environments";
 const IMAGINED_ENVIRONMENTS: &str = "environments.world-model";
 
 /// Columns of the log after the step and the losses.
-const COLUMNS: [&str; 14] = [
+const COLUMNS: [&str; 15] = [
     "world_model",
+    "hindsight",
     "risk",
     "falls",
     "tilt",
@@ -186,8 +187,8 @@ impl Trainer {
     /// When a tensor cannot be made.
     pub fn emp(&self) -> Result<Emp> {
         let mut tensors: Tensors = self.learner.normalizer().tensors()?.into_iter().collect();
-        for (name, tensor) in self.learner.network().tensors() {
-            tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor.copy()?);
+        for (name, tensor) in self.learner.average() {
+            tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor.clone());
         }
         let robot = &self.equipment.robot;
         let metadata = CheckpointMetadata::for_joints(emp::KIND, robot, robot.joints());
@@ -219,7 +220,7 @@ impl Trainer {
             &self.equipment.robot,
             self.learner.network().config(),
             self.learner.normalizer(),
-            &self.learner.network().tensors(),
+            self.learner.average(),
             training,
             run::git_revision(),
         )?)
@@ -321,6 +322,7 @@ impl Step {
         let mut row = update.terms.to_vec();
         row.extend([
             self.world_model,
+            update.hindsight,
             update.risk,
             sums.falls,
             sums.orientation / rows,

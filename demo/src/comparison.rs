@@ -91,6 +91,7 @@ impl Trials {
             ),
             false => None,
         };
+        eprintln!("counting falls over {} motions", self.motions.sources.len());
         let mut counts = Vec::new();
         for mode in [EvaluatedMode::Off, EvaluatedMode::On] {
             if has_emp || mode == EvaluatedMode::Off {
@@ -116,6 +117,13 @@ impl Trials {
                 .run(client, robot, number, &motion, EmpMode::Off)
                 .await?;
             let fell = run.fall.is_some();
+            eprintln!(
+                "hard motion {} of {}, {}: {} without the EMP",
+                number + 1,
+                self.motions.sources.len(),
+                motion.name,
+                if fell { "falls" } else { "stands" }
+            );
             let tilts = run.periods.iter().map(|period| tilt(&period.reading));
             let largest = tilts.fold(0.0, f64::max);
             let this = Fallen {

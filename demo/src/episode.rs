@@ -33,8 +33,8 @@ pub(crate) struct Episode {
     fall: Option<Fall>,
     /// Largest angle between the base's axis and the vertical, degrees.
     pub(crate) largest_tilt_deg: f64,
-    /// Least distance of the centre of mass from the edge of the feet's support polygon, cm, negative outside; as answered.
-    smallest_margin_cm: f32,
+    /// Least distance of the centre of mass from the edge of the feet's support polygon, cm, negative outside; as answered, none without an answer.
+    smallest_margin_cm: Option<f32>,
     /// The paper's metrics of this one episode, and what the EMP took for them; the goal that is asked for is that after the
     /// guards' ramps.
     pub(crate) metrics: Metrics<f64>,
@@ -71,7 +71,7 @@ impl Episode {
         let seconds = run.periods.len() as f64 / rate;
         let periods = || run.periods.iter();
         let times = || periods().filter_map(|period| period.answer.times);
-        let margins = periods().map(|period| 100.0 * period.answer.margin);
+        let margins = periods().filter_map(|period| period.answer.margin);
         let tilts = periods().map(|period| tilt(&period.reading));
         Self {
             emp_mode: run
@@ -86,7 +86,7 @@ impl Episode {
                 reason: reason.to_string(),
             }),
             largest_tilt_deg: tilts.fold(0.0, f64::max).to_degrees(),
-            smallest_margin_cm: margins.fold(f32::INFINITY, f32::min),
+            smallest_margin_cm: margins.reduce(f32::min).map(|margin| 100.0 * margin),
             metrics: metrics(robot, run),
             saturated_share: saturated_share(robot, run),
             pushes: periods().filter(|period| period.pushed).count(),
@@ -110,10 +110,19 @@ impl Episode {
     /// How the robot stood, in a line.
     pub(crate) fn balance(&self) -> String {
         match &self.fall {
-            None => format!(
-                "stood for {:.1} s, base tilted by {:.1}° at most, centre of mass at least {:.1} cm inside the edge of the feet",
-                self.seconds, self.largest_tilt_deg, self.smallest_margin_cm
-            ),
+            None => {
+                let tilt = self.largest_tilt_deg;
+                let mut text = format!(
+                    "stood for {:.1} s, base tilted by {tilt:.1}° at most",
+                    self.seconds
+                );
+                if let Some(margin) = self.smallest_margin_cm {
+                    text += &format!(
+                        ", centre of mass at least {margin:.1} cm inside the edge of the feet"
+                    );
+                }
+                text
+            }
             Some(Fall { time, reason }) => format!("FELL after {time:.2} s: {reason}"),
         }
     }

@@ -28,41 +28,30 @@ pub(crate) fn sheet(
     let rate = robot.control_rate_hz();
     let frames = motion.clip.frames.len();
     let moments = moments(frames, off, rate);
-    let outcomes = summary.outcomes();
     let runs = std::iter::once(("EMP off", OFF, off)).chain(on.iter().map(|on| ("EMP on", ON, on)));
     let strips = runs
-        .zip(outcomes)
+        .zip(summary.outcomes())
         .map(|((name, color, run), outcome)| {
-            let postures = postures(robot, run)?;
+            let figures = figures(robot, run, &moments)?;
+            let (tilt, margin) = stance(run, rate);
             Ok(Strip {
                 name,
                 outcome,
                 color,
-                figures: moments
-                    .iter()
-                    .map(|&frame| standing(run, &postures, frame, rate))
-                    .collect(),
-                tilt: curve(run, rate, |period| {
-                    tilt(&period.reading).to_degrees() as f32
-                }),
-                margin: curve(run, rate, |period| 100.0 * period.answer.margin),
+                figures,
+                tilt,
+                margin,
                 fall: run.fall.map(|_| run.periods.len() as f64 / rate),
             })
         })
         .collect::<Result<Vec<_>>>()?;
-    let joints: Vec<JointCurves> = match on {
-        Some(on) => {
-            let most = summary.joints().iter().take(JOINTS);
-            most.map(|joint| joint_curves(on, joint, rate)).collect()
-        }
-        None => Vec::new(),
-    };
-    let longest = on.as_ref().unwrap_or(off);
-    let pushed = longest.periods.iter().enumerate();
-    let pushes: Vec<f64> = pushed
-        .filter(|(_, period)| period.pushed)
-        .map(|(frame, _)| motion.time(frame))
+    let most_changed = summary.joints().iter().take(JOINTS);
+    let joints: Vec<JointCurves> = most_changed
+        .zip(on.iter().cycle())
+        .map(|(joint, on)| joint_curves(on, joint, rate))
         .collect();
+    let runs = std::iter::once(off).chain(on);
+    let longest = runs.max_by_key(|run| run.periods.len()).unwrap_or(off);
     let times: Vec<f64> = moments.iter().map(|&frame| motion.time(frame)).collect();
     let person: Vec<_> = moments
         .iter()
@@ -75,12 +64,19 @@ pub(crate) fn sheet(
         person: &person,
         strips: &strips,
         joints: &joints,
-        seconds: motion.time(frames),
-        pushes: &pushes,
+        seconds: longest.periods.len() as f64 / rate,
+        pushes: &pushes(longest, rate),
     };
     picture
         .png()
         .with_context(|| format!("cannot draw {}", robot.name()))
+}
+
+/// When the robot was pushed, seconds.
+fn pushes(run: &Run, rate: f64) -> Vec<f64> {
+    let periods = run.periods.iter().enumerate();
+    let pushed = periods.filter(|(_, period)| period.pushed);
+    pushed.map(|(frame, _)| frame as f64 / rate).collect()
 }
 
 /// Frames to show: the last ones before the fall without the EMP, or else some over the whole motion.
@@ -96,41 +92,50 @@ fn moments(frames: usize, off: &Run, rate: f64) -> Vec<usize> {
     moments
 }
 
-/// The robot in a frame; in its last one where it had fallen by then.
-fn standing(run: &Run, postures: &[Posture], frame: usize, rate: f64) -> Standing {
+/// The robot in each of the frames; in its last one where it had fallen by then.
+fn figures(robot: &Robot, run: &Run, frames: &[usize]) -> Result<Vec<Standing>> {
+    let postures = postures(robot, run)?;
     let last = run.periods.len() - 1;
-    let shown = frame.min(last);
-    let reading = &run.periods[shown].reading;
-    let Posture { pose, legs, .. } = &postures[shown];
-    let height = Translation3::new(0.0, 0.0, reading.position.z);
-    Standing {
-        pose: pose.clone(),
-        legs: legs.clone(),
-        base: Isometry3::from_parts(height, reading.orientation).cast(),
-        tilt: tilt(reading).to_degrees() as f32,
-        fallen: run
-            .fall
-            .filter(|_| frame >= last)
-            .map(|_| (last + 1) as f64 / rate),
-    }
+    let fall = run
+        .fall
+        .map(|_| (last + 1) as f64 / robot.control_rate_hz());
+    let standing = |&frame: &usize| {
+        let shown = frame.min(last);
+        let reading = &run.periods[shown].reading;
+        let Posture { pose, legs, .. } = &postures[shown];
+        let height = Translation3::new(0.0, 0.0, reading.position.z);
+        Standing {
+            pose: pose.clone(),
+            legs: legs.clone(),
+            base: Isometry3::from_parts(height, reading.orientation).cast(),
+            tilt: tilt(reading).to_degrees() as f32,
+            fallen: fall.filter(|_| frame >= last),
+        }
+    };
+    Ok(frames.iter().map(standing).collect())
+}
+
+/// Tilt in degrees and margin in cm over time.
+fn stance(run: &Run, rate: f64) -> (Curve, Curve) {
+    let degrees = |period: &Period| Some(tilt(&period.reading).to_degrees() as f32);
+    let centimetres = |period: &Period| Some(100.0 * period.answer.margin?);
+    (curve(run, rate, degrees), curve(run, rate, centimetres))
 }
 
 fn joint_curves(run: &Run, joint: &JointChange, rate: f64) -> JointCurves {
+    let degrees = |goal: &[f32]| Some(goal[joint.index].to_degrees());
     JointCurves {
         name: joint.joint.replace('_', " "),
-        asked: curve(run, rate, |period| {
-            period.answer.goal[joint.index].to_degrees()
-        }),
-        executed: curve(run, rate, |period| {
-            period.answer.targets.goal[joint.index].to_degrees()
-        }),
+        asked: curve(run, rate, |period| degrees(&period.answer.goal)),
+        executed: curve(run, rate, |period| degrees(&period.answer.targets.goal)),
     }
 }
 
-/// A value over time, of each control period at its end.
-fn curve(run: &Run, rate: f64, value: impl Fn(&Period) -> f32) -> Curve {
+/// A value over time, of each control period that has one, at its end.
+fn curve(run: &Run, rate: f64, value: impl Fn(&Period) -> Option<f32>) -> Curve {
+    let time = |frame: usize| ((frame + 1) as f64 / rate) as f32;
     let periods = run.periods.iter().enumerate();
     periods
-        .map(|(frame, period)| (((frame + 1) as f64 / rate) as f32, value(period)))
+        .filter_map(|(frame, period)| Some((time(frame), value(period)?)))
         .collect()
 }

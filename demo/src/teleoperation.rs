@@ -25,8 +25,8 @@ pub(crate) struct Answered {
     pub(crate) targets: JointTargets,
     /// When the EMP changes goals.
     pub(crate) emp_mode: EmpMode,
-    /// How far the centre of mass is inside the support polygon of the feet, metres.
-    pub(crate) margin: f32,
+    /// How far the centre of mass is inside the support polygon of the feet, metres; none before the first answer.
+    pub(crate) margin: Option<f32>,
     /// What the guards did, in words.
     pub(crate) guards: Vec<String>,
     /// Time in the retargeter, and in EMP and policy; none where nothing was computed.
@@ -48,7 +48,7 @@ impl Answered {
                 legs: angles(robot.leg_joints()),
             },
             emp_mode: EmpMode::Unspecified,
-            margin: 0.0,
+            margin: None,
             guards: Vec::new(),
             times: None,
         }
@@ -79,7 +79,7 @@ impl Answered {
                 legs: frame.leg_targets,
             },
             emp_mode,
-            margin: filter.center_of_mass_margin,
+            margin: Some(filter.center_of_mass_margin),
             guards: frame.guard.as_ref().map_or_else(Vec::new, in_words),
             times: times.map(|(retargeter, policy)| [retargeter, policy]),
         })

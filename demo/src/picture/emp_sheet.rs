@@ -33,6 +33,8 @@ const JOINT_CHART: f32 = 176.0;
 const AXIS: f32 = 44.0;
 /// Space between the strips and the charts, and between charts, pixels.
 const CHART_GAP: f32 = 16.0;
+/// Half the width and half the height of the shadow below a robot, metres.
+const SHADOW: [f32; 2] = [0.34, 0.08];
 /// Size of small text, pixels.
 const SMALL: f32 = 21.0;
 
@@ -57,7 +59,7 @@ pub(crate) struct EmpSheet<'a> {
     pub(crate) strips: &'a [Strip],
     /// Goal joints that the EMP changed; may be none.
     pub(crate) joints: &'a [JointCurves],
-    /// Length of the motion, seconds.
+    /// Length of the charts, seconds.
     pub(crate) seconds: f64,
     /// When the robots were pushed, seconds.
     pub(crate) pushes: &'a [f64],
@@ -164,8 +166,9 @@ impl EmpSheet<'_> {
         let largest = values.map(|(_, value)| *value).fold(0.0, f32::max);
         let end = (1.08 * largest).clamp(TILT_AXIS[0], TILT_AXIS[1]);
         let title = "tilt of the base, degrees";
-        let chart = self.chart(canvas, place, [0.0, end], title);
-        self.runs(canvas, &chart, |strip| &strip.tilt);
+        // Below 0 there is room for the moments' numbers.
+        let chart = self.chart(canvas, place, [-0.14 * end, end], title);
+        self.runs(canvas, &chart, |strip| strip.tilt.clone());
         chart
     }
 
@@ -184,7 +187,12 @@ impl EmpSheet<'_> {
         ];
         let title = "centre of mass inside the edge of the feet, cm (below 0: outside)";
         let chart = self.chart(canvas, place, range, title);
-        self.runs(canvas, &chart, |strip| &strip.margin);
+        // Once the robot falls, how far it is out tells no more.
+        let inside = |strip: &Strip| {
+            let margin = strip.margin.iter().copied();
+            margin.take_while(|(_, value)| *value >= range[0]).collect()
+        };
+        self.runs(canvas, &chart, inside);
         chart
     }
 
@@ -204,7 +212,7 @@ impl EmpSheet<'_> {
         chart
     }
 
-    fn runs(&self, canvas: &mut Canvas, chart: &Chart, curve: impl Fn(&Strip) -> &Curve) {
+    fn runs(&self, canvas: &mut Canvas, chart: &Chart, curve: impl Fn(&Strip) -> Curve) {
         let names: Vec<_> = self
             .strips
             .iter()
@@ -212,7 +220,7 @@ impl EmpSheet<'_> {
             .collect();
         chart.names(canvas, &names);
         for strip in self.strips {
-            chart.curve(canvas, curve(strip), strip.color);
+            chart.curve(canvas, &curve(strip), strip.color);
         }
     }
 
@@ -249,15 +257,13 @@ struct Row {
 impl Rows {
     fn new(sheet: &EmpSheet<'_>) -> Self {
         let camera = Camera::front_left();
-        let person = sheet.person.iter().map(Figure::person).collect();
+        let person = sheet.person.iter().map(Figure::person);
+        let person = person.map(|figure| View::new(&figure, &camera)).collect();
         let runs = sheet.strips.iter().map(|strip| {
-            let figures = strip.figures.iter().map(Standing::figure);
-            figures.collect::<Vec<_>>()
+            let figures = strip.figures.iter();
+            figures.map(|robot| robot.view(&camera)).collect()
         });
-        let rows: Vec<Row> = std::iter::once(person)
-            .chain(runs)
-            .map(|figures| Row::new(&figures, &camera))
-            .collect();
+        let rows: Vec<Row> = std::iter::once(person).chain(runs).map(Row::new).collect();
         let views = rows.iter().flat_map(|row| &row.views);
         let widest = views
             .map(|view| view.bounds.right - view.bounds.left)
@@ -319,19 +325,15 @@ impl Rows {
         if let Caption::Robot(robot) = caption {
             let (x, y) = robot.shadow(&Camera::front_left());
             let at = (origin.0 + x * self.scale, origin.1 - y * self.scale);
-            let half = 0.34 * self.scale;
-            canvas.ellipse(at, (half, 0.24 * half), GROUND);
+            let [x, y] = SHADOW.map(|half| half * self.scale);
+            canvas.ellipse(at, (x, y), GROUND);
         }
         view.draw(canvas, origin, self.scale);
     }
 }
 
 impl Row {
-    fn new(figures: &[Figure], camera: &Camera) -> Self {
-        let views: Vec<View> = figures
-            .iter()
-            .map(|figure| View::new(figure, camera))
-            .collect();
+    fn new(views: Vec<View>) -> Self {
         let bounds = views
             .iter()
             .fold(Bounds::NONE, |bounds, view| bounds.union(view.bounds));
@@ -374,8 +376,18 @@ impl Caption<'_> {
 }
 
 impl Standing {
-    fn figure(&self) -> Figure {
-        Figure::robot(&self.pose, &self.legs).placed(&self.base)
+    /// The robot as the camera sees it, with room for its shadow.
+    fn view(&self, camera: &Camera) -> View {
+        let figure = Figure::robot(&self.pose, &self.legs).placed(&self.base);
+        let mut view = View::new(&figure, camera);
+        let (x, y) = self.shadow(camera);
+        for corner in [
+            (x - SHADOW[0], y - SHADOW[1]),
+            (x + SHADOW[0], y + SHADOW[1]),
+        ] {
+            view.bounds = view.bounds.with(corner, 0.0);
+        }
+        view
     }
 
     /// The point of the floor below the middle of the feet, as the camera sees it, metres.

@@ -67,6 +67,8 @@ pub struct Learner {
     objective: Objective,
     /// Angles of the goal joints in the default pose, rad.
     default_pose: Vec<f32>,
+    /// 1 for the goal joints of which hindsight speaks, else 0.
+    lesson_joints: Vec<f32>,
     reference: [f64; 2],
     progress: Progress,
 }
@@ -173,6 +175,14 @@ impl Learner {
                 .goal_joints()
                 .iter()
                 .map(|joint| joint.default as f32)
+                .collect(),
+            lesson_joints: robot
+                .goal_joints()
+                .iter()
+                .map(|joint| {
+                    let mut words = settings.hindsight.joints.iter();
+                    f32::from(u8::from(words.any(|word| joint.name.contains(word))))
+                })
                 .collect(),
             reference: warm_up.reference,
         })
@@ -529,7 +539,8 @@ impl Learner {
         let default = Tensor::new(self.default_pose.as_slice(), &Device::Cpu)?;
         let distances = gathered(&rollout.goals, joints, rows)?.broadcast_sub(&default)?;
         let wiser = (distances * settings.amplitude)?.broadcast_add(&default)?;
-        let errors = (answers - wiser)?.sqr()?.sum(1)?;
+        let joints = Tensor::new(self.lesson_joints.as_slice(), &Device::Cpu)?;
+        let errors = (answers - wiser)?.sqr()?.broadcast_mul(&joints)?.sum(1)?;
         (errors * Tensor::from_vec(weights, rows.len(), &Device::Cpu)?)?.sum_all()
     }
 

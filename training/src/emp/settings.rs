@@ -126,7 +126,7 @@ pub struct WorldModelSettings {
 
 /// The lesson of falls. Once the robot has fallen, it is known of every moment of the last second or two that its goal should have
 /// been nearer the default pose. Where such moments look like others that end well, the EMP answers between the two.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HindsightSettings {
     /// Weight of ‖ĝ − (g₀ + amplitude · (g − g₀))‖² in the moments before a fall, g₀ the default pose. 0: no such loss.
@@ -135,6 +135,8 @@ pub struct HindsightSettings {
     pub frames: usize,
     /// Share of the distance from the default pose that should have been asked for.
     pub amplitude: f64,
+    /// Words in the names of the goal joints of which that is said: those that fell the robot.
+    pub joints: Vec<String>,
 }
 
 /// The price of falls and of what leads to them. One imagined period cannot see a fall that builds up over a second, and the
@@ -231,6 +233,9 @@ impl Settings {
                 weight: 0.0,
                 frames: 100,
                 amplitude: 0.4,
+                joints: ["waist", "shoulder_pitch", "shoulder_roll"]
+                    .map(str::to_owned)
+                    .to_vec(),
             },
             risk: RiskSettings {
                 weight: 0.0,
@@ -294,7 +299,7 @@ impl Settings {
             horizon: 0,
             hindsight: HindsightSettings {
                 weight: 80.0,
-                ..paper.hindsight
+                ..paper.hindsight.clone()
             },
             risk: RiskSettings {
                 weight: 1000.0,

@@ -344,7 +344,7 @@ impl ComparisonSummary {
         let counts: Vec<String> = self.all_motions.iter().map(Count::text).collect();
         let motions = self.all_motions.first().map_or(0, |count| count.motions);
         format!(
-            "motion {number} of {motions}: {rule}; of all {motions}, the robot falls in {}",
+            "motion {number} of {motions}: {rule}; evaluated on all {motions}, the robot falls in {}",
             counts.join(" and in ")
         )
     }

@@ -133,14 +133,6 @@ impl EmpSheet<'_> {
             let at = (MARGIN, 88.0 + 32.0 * line as f32);
             canvas.text(at, 24.0, Align::Left, FAINT, text);
         }
-        let right = WIDTH - MARGIN;
-        for (line, (text, color)) in [("left arm and leg", LEFT), ("right arm and leg", RIGHT)]
-            .into_iter()
-            .enumerate()
-        {
-            let at = (right, 46.0 + 34.0 * line as f32);
-            canvas.text(at, 24.0, Align::Right, color, text);
-        }
     }
 
     fn charts(&self, canvas: &mut Canvas, top: f32) {
@@ -285,7 +277,10 @@ impl Rows {
         for (number, row) in self.rows.iter().enumerate() {
             let strip = number.checked_sub(1).map(|run| &sheet.strips[run]);
             match strip {
-                None => row_title(canvas, top, INK, "the person"),
+                None => {
+                    row_title(canvas, top, INK, "the person");
+                    sides(canvas, top);
+                }
                 Some(strip) => row_title(canvas, top, strip.color, &strip.outcome),
             }
             for column in 0..row.views.len() {
@@ -403,6 +398,15 @@ impl Standing {
 
 fn row_title(canvas: &mut Canvas, top: f32, color: Rgb, text: &str) {
     canvas.text((MARGIN, top + 29.0), 27.0, Align::Left, color, text);
+}
+
+/// The colours of both sides, at the right end of a row's title.
+fn sides(canvas: &mut Canvas, top: f32) {
+    let mut right = WIDTH - MARGIN;
+    for (text, color) in [("right arm and leg", RIGHT), ("left arm and leg", LEFT)] {
+        canvas.text((right, top + 29.0), 24.0, Align::Right, color, text);
+        right -= canvas.text_width(24.0, text) + 28.0;
+    }
 }
 
 fn cell_width(columns: usize) -> f32 {

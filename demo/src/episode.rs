@@ -117,9 +117,7 @@ impl Episode {
                     self.seconds
                 );
                 if let Some(margin) = self.smallest_margin_cm {
-                    text += &format!(
-                        ", centre of mass at least {margin:.1} cm inside the edge of the feet"
-                    );
+                    text += &format!(", smallest margin of the centre of mass {margin:.1} cm");
                 }
                 text
             }

@@ -5,7 +5,7 @@ use std::thread;
 
 use anyhow::{Context, Result};
 use emp_robot::Robot;
-use emp_sim::{Body, BodyParameters, Reading, SimError, Stage, Start, Targets};
+use emp_sim::{Body, BodyParameters, Reading, Stage, Start, Targets};
 use nalgebra::Vector3;
 use tokio::sync::mpsc;
 
@@ -28,7 +28,7 @@ struct Command {
 /// A simulated robot; its thread ends when this is dropped.
 pub(crate) struct Simulator {
     commands: mpsc::Sender<Command>,
-    readings: mpsc::Receiver<Result<Reading, SimError>>,
+    readings: mpsc::Receiver<Result<Reading>>,
 }
 
 impl Simulator {
@@ -83,15 +83,11 @@ impl Simulator {
 
     async fn reading(&mut self) -> Result<Reading> {
         let reading = self.readings.recv().await;
-        Ok(reading.context("the physics thread is gone")??)
+        reading.context("the physics thread is gone")?
     }
 }
 
-fn place(
-    robot: &Robot,
-    angles: &[f64],
-    parameters: BodyParameters,
-) -> Result<(Stage, Body), SimError> {
+fn place(robot: &Robot, angles: &[f64], parameters: BodyParameters) -> Result<(Stage, Body)> {
     let mut stage = Stage::new(robot)?;
     let body = stage.place(&Start {
         joint_positions: angles,
@@ -106,7 +102,7 @@ fn simulate(
     mut stage: Stage,
     mut body: Body,
     mut inbox: mpsc::Receiver<Command>,
-    outbox: &mpsc::Sender<Result<Reading, SimError>>,
+    outbox: &mpsc::Sender<Result<Reading>>,
 ) {
     let mut reading = body.reading().clone();
     while outbox.blocking_send(Ok(reading)).is_ok() {

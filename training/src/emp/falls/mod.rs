@@ -28,7 +28,6 @@ use auroc::auroc;
 pub(super) use auroc::percentile;
 use cuts::Cut;
 pub use reach::Reaches;
-pub(super) use trace::tilt;
 use trace::{Moment, Tracer};
 
 /// How long before a fall something shows, frames: from the first up to the second, exclusive.

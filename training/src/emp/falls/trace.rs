@@ -28,7 +28,7 @@ pub(super) struct Moment {
 }
 
 /// Angle between the base's vertical axis and the world's, rad.
-pub(in crate::emp) fn tilt(orientation: &UnitQuaternion<f64>) -> f64 {
+fn tilt(orientation: &UnitQuaternion<f64>) -> f64 {
     let [_, _, down] = projected_gravity(orientation);
     (-down).clamp(-1.0, 1.0).acos()
 }

@@ -15,10 +15,13 @@ use emp_sim::{
 use serde::Serialize;
 
 use super::{Candidate, EmpRun, Outcome, Played, evaluation, sums};
-use crate::emp::falls::{percentile, tilt};
+use crate::emp::falls::percentile;
 
 /// Shares of safe frames that a gate lets pass.
 const PERCENTILES: [f64; 3] = [0.5, 0.9, 0.99];
+
+/// Tilts at which a gate opens, rad: from what a standing robot has now and then to a fall that has begun.
+const TILTS: [f32; 4] = [0.03, 0.05, 0.1, 0.2];
 
 /// A gate that opens so many control periods before the fall, or fewer, opens too late.
 const TOO_LATE: usize = 15;
@@ -42,8 +45,8 @@ pub struct GateRow {
     pub(super) too_late: usize,
 }
 
-/// The gates of `candidate`: none, the paper's, and by percentile of regloss and of tilt in frames in which the policy alone
-/// stands under nominal conditions.
+/// The gates of `candidate`: none, the paper's, by percentile of regloss in frames of the policy alone under nominal conditions,
+/// and by tilt.
 pub(super) fn compare(
     run: &EmpRun<'_>,
     candidate: &Candidate,
@@ -99,18 +102,17 @@ fn gates(
     progress: &mut dyn Progress,
 ) -> Result<Vec<(DangerGate, String)>> {
     let never = DangerGate::Regloss(f32::INFINITY);
-    let mut safe = Safe::default();
+    let mut safe = Regloss::default();
     let controller = gated(run, candidate, never);
     evaluation(run, &controller, Condition::Nominal, &mut safe, progress)?;
     let mut gates = vec![(DangerGate::PAPER, "the paper's".to_owned())];
     for share in PERCENTILES {
+        let limit = percentile(safe.0.clone(), share);
         let origin = format!("p{:.0} of nominal frames", 100.0 * share);
-        let regloss = percentile(safe.regloss.clone(), share);
-        gates.extend(regloss.map(|limit| (DangerGate::Regloss(limit as f32), origin.clone())));
-        let tilt = percentile(safe.tilt.clone(), share);
-        gates.extend(tilt.map(|limit| (DangerGate::Tilt(limit as f32), origin)));
+        gates.extend(limit.map(|limit| (DangerGate::Regloss(limit as f32), origin)));
     }
-    gates.sort_by_key(|(gate, _)| matches!(gate, DangerGate::Tilt(_)));
+    let tilts = TILTS.map(|limit| (DangerGate::Tilt(limit), "fixed".to_owned()));
+    gates.extend(tilts);
     Ok(gates)
 }
 
@@ -151,19 +153,14 @@ fn play(
     Ok((played, too_late))
 }
 
-/// Regloss and tilt of every frame.
+/// The regloss of every frame.
 #[derive(Default)]
-struct Safe {
-    regloss: Vec<f64>,
-    /// Angle between the base's vertical axis and the world's, rad.
-    tilt: Vec<f64>,
-}
+struct Regloss(Vec<f64>);
 
-impl Observer for Safe {
+impl Observer for Regloss {
     fn executed(&mut self, frame: &ExecutedFrame<'_>) {
         let regloss = frame.output.risk.map(|risk| f64::from(risk.regloss));
-        self.regloss.extend(regloss);
-        self.tilt.push(tilt(&frame.reading.orientation));
+        self.0.extend(regloss);
     }
 }
 

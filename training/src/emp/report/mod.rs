@@ -2,6 +2,7 @@
 
 mod frontier;
 mod gates;
+mod matched;
 #[cfg(test)]
 mod tests;
 mod text;
@@ -25,6 +26,7 @@ use serde::Serialize;
 
 pub use frontier::draw;
 pub use gates::GateRow;
+pub use matched::{Match, Price};
 
 /// Conditions beside the hard ones.
 const OTHERS: [Condition; 2] = [Condition::Nominal, Condition::Easy];
@@ -120,6 +122,8 @@ pub struct EmpReport {
     rows: Vec<Row>,
     /// Each EMP against each filter that needs no learning, over the hard conditions.
     duels: Vec<Duel>,
+    /// Each EMP beside each family where that cuts as many falls.
+    matches: Vec<Match>,
     /// The gates of one EMP.
     gates: Vec<GateRow>,
 }
@@ -189,11 +193,13 @@ pub fn report(run: &EmpRun<'_>, progress: &mut dyn Progress) -> Result<EmpReport
         None => Vec::new(),
     };
     let raw = &played[0];
+    let rows: Vec<Row> = played.iter().map(|one| one.row(raw, run.seed)).collect();
     Ok(EmpReport {
         robot: run.policy.robot().name().to_owned(),
         clips: run.clips.len(),
         seed: run.seed,
-        rows: played.iter().map(|one| one.row(raw, run.seed)).collect(),
+        matches: matched::matches(&rows),
+        rows,
         duels: duels(&played, run.seed),
         gates,
     })

@@ -5,7 +5,7 @@ use std::fmt;
 use emp_models::emp::DangerGate;
 use emp_sim::{metrics::Interval, suite::Condition};
 
-use super::{Duel, EmpReport, GateRow, Outcome, Row};
+use super::{Duel, EmpReport, GateRow, Match, Outcome, Row};
 
 impl fmt::Display for EmpReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -20,6 +20,7 @@ impl fmt::Display for EmpReport {
         self.write_conditions(f)?;
         self.write_under(f, Condition::Nominal)?;
         self.write_under(f, Condition::Easy)?;
+        self.write_matches(f)?;
         self.write_duels(f)?;
         self.write_gates(f)
     }
@@ -113,6 +114,45 @@ impl EmpReport {
                 metrics.change.mean,
                 metrics.relative_change.mean,
             )?;
+        }
+        writeln!(f)
+    }
+
+    fn write_matches(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.matches.is_empty() {
+            return Ok(());
+        }
+        writeln!(
+            f,
+            "### What each family takes where it cuts as many falls\n"
+        )?;
+        writeln!(
+            f,
+            "The EMP's figure / the family's, read off between the family's members, hard conditions together.\n"
+        )?;
+        writeln!(f, "| EMP | family | relL2 | mean change, rad | MJP |")?;
+        writeln!(f, "|---|---|---|---|---|")?;
+        for Match {
+            emp,
+            family,
+            ours,
+            theirs,
+        } in &self.matches
+        {
+            write!(f, "| **{emp}** | {family} |")?;
+            match theirs {
+                Some(theirs) => writeln!(
+                    f,
+                    " {:.3} / {:.3} | {:.4} / {:.4} | {:.3} / {:.3} |",
+                    ours.relative_change,
+                    theirs.relative_change,
+                    ours.change,
+                    theirs.change,
+                    ours.mjp,
+                    theirs.mjp
+                )?,
+                None => writeln!(f, " never cuts as many | | |")?,
+            }
         }
         writeln!(f)
     }

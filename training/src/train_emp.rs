@@ -53,6 +53,9 @@ pub(crate) struct TrainingArguments {
     /// Continue from the checkpoint, or from those that there are.
     #[arg(long)]
     resume: bool,
+    /// Let a resumed run go on with other settings than it had.
+    #[arg(long, requires = "resume")]
+    change_settings: bool,
     /// Seconds between two checkpoints.
     #[arg(long, default_value_t = 120)]
     save_every: u64,
@@ -199,7 +202,7 @@ impl Workshop {
         let equipment = self.equipment.clone();
         let checkpoint = files.checkpoint();
         let mut trainer = if checkpoint.exists() {
-            Trainer::resume(equipment, settings, &checkpoint)?
+            Trainer::resume(equipment, settings, &checkpoint, arguments.change_settings)?
         } else {
             Trainer::new(equipment, settings)?
         };

@@ -76,6 +76,8 @@ pub struct Equipment {
 pub struct Trainer {
     equipment: Equipment,
     settings: Settings,
+    /// Settings that the run had before, with the steps at which they were left.
+    past: Vec<Phase>,
     explorer: Explorer,
     learner: Learner,
     /// The world model, where anything is imagined.
@@ -84,10 +86,19 @@ pub struct Trainer {
     steps: u64,
 }
 
+/// A part of a run.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Phase {
+    until_step: u64,
+    settings: Settings,
+}
+
 /// What a run's checkpoint says of its progress.
 #[derive(Serialize, Deserialize)]
 struct Saved {
     settings: Settings,
+    #[serde(default)]
+    past: Vec<Phase>,
     steps: u64,
     learner: learner::Progress,
     /// Rollouts and optimiser steps of the world model.
@@ -131,22 +142,29 @@ impl Trainer {
             explorer,
             equipment,
             settings,
+            past: Vec::new(),
             steps: 0,
         })
     }
 
-    /// Continues from a checkpoint of this run.
+    /// Continues from a checkpoint of this run. Only if `may_change`, the settings may be others than before: a new phase of the
+    /// run, which its weights will tell.
     ///
     /// # Errors
-    /// When the checkpoint is damaged, or its run had other settings or another robot.
-    pub fn resume(equipment: Equipment, settings: Settings, path: &Path) -> Result<Self> {
+    /// When the checkpoint is damaged, or its run had another robot, other networks or, unasked, other settings.
+    pub fn resume(
+        equipment: Equipment,
+        settings: Settings,
+        path: &Path,
+        may_change: bool,
+    ) -> Result<Self> {
         let (metadata, mut tensors) = checkpoint::load(path)?;
         metadata.check(path, &run_metadata(&equipment.robot))?;
         let saved: Saved = serde_json::from_value(metadata.training)
             .with_context(|| format!("{}: metadata field training", path.display()))?;
         ensure!(
-            saved.settings == settings,
-            "{}: the run was started with {:?}, not with {settings:?}",
+            may_change || saved.settings == settings,
+            "{}: the run has {:?}, not {settings:?}; --change-settings starts a new phase of it",
             path.display(),
             saved.settings
         );
@@ -158,6 +176,13 @@ impl Trainer {
         };
         let environments = snapshot(ENVIRONMENTS)?;
         let mut trainer = Self::new(equipment, settings)?;
+        trainer.past = saved.past;
+        if saved.settings != trainer.settings {
+            trainer.past.push(Phase {
+                until_step: saved.steps,
+                settings: saved.settings,
+            });
+        }
         if let (Some(imaginer), Some(counts)) = (&mut trainer.imaginer, saved.imaginer) {
             let environments = snapshot(IMAGINED_ENVIRONMENTS)?;
             imaginer
@@ -209,6 +234,7 @@ impl Trainer {
         let training = serde_json::json!({
             "command": "emp-train emp",
             "settings": self.settings,
+            "past": self.past,
             "steps": self.steps,
             "policy": self.equipment.policy.metadata().version(),
             "operating_point": self.learner.reference(),
@@ -248,6 +274,7 @@ impl Trainer {
         metadata.config = serde_json::to_value(self.learner.network().config())?;
         metadata.training = serde_json::to_value(Saved {
             settings: self.settings.clone(),
+            past: self.past.clone(),
             steps: self.steps,
             learner: self.learner.progress(),
             imaginer: counts,

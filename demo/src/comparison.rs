@@ -330,7 +330,9 @@ impl ComparisonSummary {
             0.0 => text += ", no pushes",
             push => text += &format!(", pushed by {push} m/s every {SHORT_PUSH_INTERVAL} s"),
         }
-        text += "; the same person, robot and seeds in both runs";
+        if self.on.is_some() {
+            text += "; the same person, robot and seeds in both runs";
+        }
         text
     }
 

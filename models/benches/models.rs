@@ -1,4 +1,4 @@
-//! Benchmarks of the models: the linear op against candle's own matrix multiply, the kinematics op against the same maths
+//! Benchmarks of the models: the linear op against candle's own matrix multiply, packed inference, the kinematics op against the same maths
 //! composed of candle ops, and the retargeter by batch size. Ratios within one run are what counts.
 
 use std::{hint::black_box, path::Path, sync::Arc};
@@ -7,8 +7,10 @@ use candle_core::{D, DType, Device, Tensor, Var};
 use candle_nn::{Module as _, VarBuilder, VarMap};
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use emp_models::{
+    emp::{EmpConfig, EmpNetwork},
     kinematics::ForwardKinematics,
     linear::{self, Linear},
+    policy::{Normalizer, Policy},
     retarget::{Effort, RetargetInput, Retargeter, Solver, Target},
 };
 use emp_motion::skills;
@@ -121,6 +123,66 @@ fn linear_op(c: &mut Criterion) {
         });
     }
     group.finish();
+    linear::set_threads(1);
+}
+
+/// An EMP of the paper's size: packed as f32 and as f16, and through candle's tensors; the shipped policy beside it.
+fn inference(c: &mut Criterion) {
+    let robot = emp27();
+    let config = EmpConfig::paper(&robot);
+    let vars = VarMap::new();
+    let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
+    let normalizer = Normalizer::identity(config.features());
+    let network = EmpNetwork::new(config.clone(), normalizer.clone(), &builder);
+    let network = network.expect("a network");
+    let single = network.pack().expect("the network packs");
+    for var in vars.all_vars() {
+        let rounded = var
+            .to_dtype(DType::F16)
+            .and_then(|x| x.to_dtype(DType::F32));
+        var.set(&rounded.expect("a conversion")).expect("its shape");
+    }
+    let half = network.pack().expect("the network packs");
+    let weights = root().join("models/weights/emp27-policy.safetensors");
+    let policy = Policy::load(&weights, robot).expect("the shipped weights load");
+    for threads in [1, 2] {
+        linear::set_threads(threads);
+        let mut group = c.benchmark_group(format!("emp_inference_{threads}_threads"));
+        group.measurement_time(std::time::Duration::from_secs(2));
+        for batch in [1, 4, 8, 16, 32, 64] {
+            let numbers = |width: usize| -> Vec<f32> {
+                (0..batch * width)
+                    .map(|i| (i as f32 * 0.37).sin())
+                    .collect()
+            };
+            let (features, goals) = (
+                numbers(config.features()),
+                numbers(config.observation.goal().len()),
+            );
+            let tensor = |numbers: &[f32]| {
+                let shape = (batch, numbers.len() / batch);
+                Tensor::from_slice(numbers, shape, &Device::Cpu).expect("a tensor")
+            };
+            let tensors = [tensor(&features), tensor(&goals)];
+            for (name, packed) in [("packed f32", &single), ("packed f16", &half)] {
+                group.bench_function(BenchmarkId::new(name, batch), |b| {
+                    b.iter(|| black_box(packed.forward(&features, &goals).expect("an answer")));
+                });
+            }
+            group.bench_function(BenchmarkId::new("tensors", batch), |b| {
+                b.iter(|| black_box(network.forward_features(&tensors[0], &tensors[1])));
+            });
+            let stacks = numbers(policy.layout().width());
+            let tensor = tensor(&stacks);
+            group.bench_function(BenchmarkId::new("policy, packed", batch), |b| {
+                b.iter(|| black_box(policy.actions(&stacks).expect("actions")));
+            });
+            group.bench_function(BenchmarkId::new("policy, tensors", batch), |b| {
+                b.iter(|| black_box(policy.forward(&tensor).expect("actions")));
+            });
+        }
+        group.finish();
+    }
     linear::set_threads(1);
 }
 
@@ -250,5 +312,5 @@ fn retargeter(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, linear_op, kinematics_op, retargeter);
+criterion_group!(benches, linear_op, inference, kinematics_op, retargeter);
 criterion_main!(benches);

@@ -193,17 +193,20 @@ impl Trials {
         };
         let motions = self.motions.sources.clone();
         let mut evaluation = client.evaluate(config, motions).await?;
+        let mut result = None;
+        // To the stream's end: only then has the server room for the next evaluation.
         while let Some(event) = evaluation.next().await.context("the evaluation")? {
-            if let EvaluationEvent::Result(result) = event {
-                let all = result.all.context("an evaluation without metrics")?;
-                return Ok(Count {
-                    emp_mode: mode,
-                    motions: all.episodes as usize,
-                    falls: result.failures.len(),
-                });
+            if let EvaluationEvent::Result(last) = event {
+                result = Some(last);
             }
         }
-        anyhow::bail!("the evaluation ended without a result")
+        let result = result.context("the evaluation ended without a result")?;
+        let all = result.all.context("an evaluation without metrics")?;
+        Ok(Count {
+            emp_mode: mode,
+            motions: all.episodes as usize,
+            falls: result.failures.len(),
+        })
     }
 }
 

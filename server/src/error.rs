@@ -148,10 +148,9 @@ impl ServiceError {
                     ("served", served.clone()),
                 ]
             }
-            Self::SeatTaken { session, seat } => vec![
-                ("session", session.clone()),
-                ("seat", (*seat).to_owned()),
-            ],
+            Self::SeatTaken { session, seat } => {
+                vec![("session", session.clone()), ("seat", (*seat).to_owned())]
+            }
             _ => Vec::new(),
         };
         pairs

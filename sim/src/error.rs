@@ -1,5 +1,6 @@
 //! What can go wrong in a simulation.
 
+use emp_models::ModelError;
 use mujoco_rs::prelude::MjDataError;
 
 use crate::goals::GoalError;
@@ -57,11 +58,17 @@ pub enum SimError {
     Goals(#[from] GoalError),
     /// A policy could not be run.
     #[error("the policy failed: {0}")]
-    Policy(#[from] emp_models::ModelError),
+    Policy(#[source] Box<ModelError>),
     /// The system gave no threads for a pool.
     #[error("cannot start threads for simulation: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
     /// MuJoCo had no memory for the simulation.
     #[error("cannot make a simulation: {0}")]
     Data(#[from] MjDataError),
+}
+
+impl From<ModelError> for SimError {
+    fn from(error: ModelError) -> Self {
+        Self::Policy(Box::new(error))
+    }
 }

@@ -610,17 +610,18 @@ fn frame_of(pose: Option<HumanPose>, state: Option<RobotState>) -> v1::Teleopera
 async fn a_bad_config_is_refused_by_name() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let server = server_with(&weights)?;
-    let bad: [(&str, &dyn Fn(&mut TeleoperateConfig)); 8] = [
-        ("config.role", &|config| config.role = 9),
-        ("config.session", &|config| config.session.clear()),
-        ("config.session", &|config| config.session = "x".repeat(65)),
-        ("config.delivery", &|config| config.delivery = 9),
-        ("config.emp_mode", &|config| config.emp_mode = 9),
-        ("config.emp_mode", &|config| {
-            config.emp_mode = EmpMode::On.into()
+    type Change = fn(&mut TeleoperateConfig);
+    let bad: [(&str, Change); 8] = [
+        ("config.role", |config| config.role = 9),
+        ("config.session", |config| config.session.clear()),
+        ("config.session", |config| config.session = "x".repeat(65)),
+        ("config.delivery", |config| config.delivery = 9),
+        ("config.emp_mode", |config| config.emp_mode = 9),
+        ("config.emp_mode", |config| {
+            config.emp_mode = EmpMode::On.into();
         }),
-        ("robot", &|config| config.robot = "nobody".to_owned()),
-        ("model", &|config| config.retargeter = "nothing".to_owned()),
+        ("robot", |config| config.robot = "nobody".to_owned()),
+        ("model", |config| config.retargeter = "nothing".to_owned()),
     ];
     for (field, change) in bad {
         let mut config = raw_config("lab", TeleoperationRole::Robot);
@@ -834,11 +835,9 @@ async fn a_server_that_drains_ends_every_end() -> anyhow::Result<()> {
     streams[0]
         .send(0, frame_of(None, Some(raw_state(&frame))))
         .await?;
-    let answer = loop {
-        match streams[0].next().await? {
-            Ok(Some(Response::Result(result))) => break result,
-            other => panic!("{other:?}"),
-        }
+    let answer = match streams[0].next().await? {
+        Ok(Some(Response::Result(result))) => result,
+        other => panic!("{other:?}"),
     };
     assert_eq!(answer.leg_targets.len(), 12);
     server.begin_shutdown();

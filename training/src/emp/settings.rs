@@ -282,7 +282,7 @@ impl Settings {
                 fusion_hidden: vec![256, 128],
                 latent: 32,
                 decoder_hidden: vec![128, 128],
-                gate: DangerGate::Tilt(0.12),
+                gate: DangerGate::PAPER,
             },
             losses: LossSettings {
                 weights: LossWeights {
@@ -298,15 +298,14 @@ impl Settings {
             },
             horizon: 0,
             hindsight: HindsightSettings {
-                weight: 80.0,
+                weight: 150.0,
                 ..paper.hindsight.clone()
             },
             risk: RiskSettings {
                 weight: 1000.0,
                 fall: 0.0,
                 orientation: 0.0,
-                contact: 0.004,
-                std: 0.02,
+                contact: 0.012,
                 target_divergence: 0.03,
                 ..paper.risk.clone()
             },
@@ -314,9 +313,15 @@ impl Settings {
                 updates: 60,
                 rows: 2048,
                 shards: 4,
-                learning_rate: [1.5e-4, 1e-3],
+                learning_rate: [3e-4, 1e-3],
                 max_gradient_norm: 10.0,
                 averaging: 0.9,
+            },
+            episodes: TrackingSettings {
+                amplitude: [0.5, 2.0],
+                pushed: 0.1,
+                randomized: 0.1,
+                ..paper.episodes
             },
             ..paper
         }

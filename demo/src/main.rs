@@ -232,10 +232,10 @@ impl Demo {
             .context("the drawing stopped")?
     }
 
-    /// The motion in real time, as a client gets it that asks for no EMP mode of its own.
+    /// The motion in real time, with the EMP off: what it does is shown on a hard motion.
     async fn follow(&self, client: &Client) -> Result<Run> {
         let conditions = self.conditions.clone();
-        let mode = EmpMode::Unspecified;
+        let mode = EmpMode::Off;
         let (robot, clip) = (&self.robot, &self.motion.clip);
         control::run(client, robot, clip, conditions, mode, Pace::RealTime).await
     }

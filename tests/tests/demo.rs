@@ -70,7 +70,7 @@ fn the_demo_closes_the_loop_and_leaves_its_files() -> anyhow::Result<()> {
     let written: Value = serde_json::from_slice(&std::fs::read(out.join("summary.json"))?)?;
     assert_eq!(summary, written);
     assert_eq!(summary["hand_load_kg"], json!([1.5, 1.5]));
-    assert_eq!(summary["emp_mode"], "on");
+    assert_eq!(summary["emp_mode"], "off");
     let factor = number(&summary["real_time_factor"]);
     // The clock sets the pace: never faster, and slower only on a machine that cannot keep up.
     assert!((0.5..=1.001).contains(&factor), "{factor}");

@@ -1,6 +1,6 @@
 //! The control periods that were collected last.
 //!
-//! Consecutive stacks share all but one frame; a [`Segment`] keeps each frame once.
+//! Consecutive stacks share all but one frame; a `Segment` keeps each frame once.
 
 use std::collections::VecDeque;
 

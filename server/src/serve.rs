@@ -175,10 +175,12 @@ async fn report_models(
         .map(|(name, state)| (name, WatchStream::new(state)))
         .collect();
     let mut failed = BTreeSet::new();
+    let mut reported = ServingStatus::Serving;
     loop {
         let (model, state) = tokio::select! {
-            Some(change) = changes.next() => change,
+            biased;
             () = shutdown.cancelled() => return,
+            Some(change) = changes.next() => change,
         };
         match state {
             ModelState::Serving => failed.remove(&model),
@@ -189,7 +191,11 @@ async fn report_models(
         } else {
             ServingStatus::NotServing
         };
-        reporter.set_service_status(MOTION, status).await;
+        // Those who watch are told of every report, changed or not.
+        if status != reported {
+            reporter.set_service_status(MOTION, status).await;
+            reported = status;
+        }
     }
 }
 

@@ -570,6 +570,16 @@ impl RawStream {
         Ok(response.map(|response| response.and_then(|response| response.message)))
     }
 
+    /// The next message that does not tell who came or went, which may come at any time.
+    async fn next_but_presence(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
+        loop {
+            let message = self.next().await?;
+            if !matches!(message, Ok(Some(Response::Presence(_)))) {
+                return Ok(message);
+            }
+        }
+    }
+
     async fn started(&mut self) -> anyhow::Result<()> {
         assert!(matches!(self.next().await?, Ok(Some(Response::Started(_)))));
         Ok(())
@@ -695,13 +705,9 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
         stream.started().await?;
         for (number, (field, frame)) in frames.into_iter().enumerate() {
             stream.send(number as u64, frame).await?;
-            // Who came and went before may be told first.
-            let dropped = loop {
-                match stream.next().await? {
-                    Ok(Some(Response::Dropped(dropped))) => break dropped,
-                    Ok(Some(Response::Presence(_))) => {}
-                    other => panic!("{role:?}: {field} is not refused but {other:?}"),
-                }
+            let answer = stream.next_but_presence().await?;
+            let Ok(Some(Response::Dropped(dropped))) = answer else {
+                panic!("{role:?}: {field} is not refused but {answer:?}")
             };
             assert_eq!(
                 (dropped.reason(), dropped.field.as_str()),
@@ -716,7 +722,7 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
             stream
                 .send(99, frame_of(None, Some(raw_state(&good))))
                 .await?;
-            let answer = stream.next().await?;
+            let answer = stream.next_but_presence().await?;
             assert!(
                 matches!(answer, Ok(Some(Response::Result(_)))),
                 "{answer:?}"

@@ -133,6 +133,10 @@ impl Catalog {
                 Ok(()) => {
                     tracing::info!(robot = robot.name(), weights = %weights.display(), "model served");
                 }
+                // Many a robot has none. A damaged one is another matter.
+                Err(_) if model == "emp" && matches!(weights.try_exists(), Ok(false)) => {
+                    tracing::info!(robot = robot.name(), weights = %weights.display(), "no EMP");
+                }
                 Err(error) => tracing::warn!(robot = robot.name(), %error, "not served"),
             }
         }

@@ -33,6 +33,13 @@ pub(crate) struct Served<I, O, M> {
     pub(crate) model: M,
 }
 
+impl<I: Send + 'static, O: Send + 'static, M> Served<I, O, M> {
+    /// The model's name, and the state of its thread.
+    fn state(&self) -> (String, watch::Receiver<ModelState>) {
+        (self.card.name.clone(), self.batcher.state())
+    }
+}
+
 /// A retargeting model; the network itself where it is the shipped one.
 pub(crate) type RetargetModel = Served<RetargetInput, RetargetOutput, Option<Arc<Retargeter>>>;
 
@@ -161,7 +168,7 @@ impl Catalog {
         let again = retargeter_from(weights, Arc::clone(robot));
         let build = first_then(Arc::clone(&model), again);
         let served = serve(card, robot, batching, build, Some(model))?;
-        self.insert_retargeter(served);
+        insert(&mut self.robots, &mut self.retargeters, served);
         Ok(())
     }
 
@@ -186,10 +193,7 @@ impl Catalog {
         let again = Controllers::load(weights, emp_weights, Arc::clone(robot));
         let build = first_then(controllers.clone(), again);
         let served = serve(card, robot, batching, build, controllers)?;
-        self.robots
-            .insert(robot.name().to_owned(), Arc::clone(robot));
-        self.policies
-            .insert(served.card.name.clone(), Arc::new(served));
+        insert(&mut self.robots, &mut self.policies, served);
         Ok(())
     }
 
@@ -208,10 +212,7 @@ impl Catalog {
         let again = Filters::load(weights, Arc::clone(robot));
         let build = first_then(filters.clone(), again);
         let served = serve(card, robot, batching, build, filters)?;
-        self.robots
-            .insert(robot.name().to_owned(), Arc::clone(robot));
-        self.filters
-            .insert(served.card.name.clone(), Arc::new(served));
+        insert(&mut self.robots, &mut self.filters, served);
         Ok(emp)
     }
 
@@ -227,15 +228,8 @@ impl Catalog {
         build: Build<RetargetInput, RetargetOutput>,
     ) -> Result<(), CatalogError> {
         let served = serve(card, robot, batching, build, None)?;
-        self.insert_retargeter(served);
+        insert(&mut self.robots, &mut self.retargeters, served);
         Ok(())
-    }
-
-    fn insert_retargeter(&mut self, served: RetargetModel) {
-        self.robots
-            .insert(served.robot.name().to_owned(), Arc::clone(&served.robot));
-        self.retargeters
-            .insert(served.card.name.clone(), Arc::new(served));
     }
 
     /// The cards of every model, by name.
@@ -250,12 +244,9 @@ impl Catalog {
 
     /// The state of every model's thread, with the model's name.
     pub(crate) fn states(&self) -> Vec<(String, watch::Receiver<ModelState>)> {
-        let retargeters = self.retargeters.values();
-        let retargeters = retargeters.map(|model| (model.card.name.clone(), model.batcher.state()));
-        let policies = self.policies.values();
-        let policies = policies.map(|model| (model.card.name.clone(), model.batcher.state()));
-        let filters = self.filters.values();
-        let filters = filters.map(|model| (model.card.name.clone(), model.batcher.state()));
+        let retargeters = self.retargeters.values().map(|model| model.state());
+        let policies = self.policies.values().map(|model| model.state());
+        let filters = self.filters.values().map(|model| model.state());
         retargeters.chain(policies).chain(filters).collect()
     }
 
@@ -266,14 +257,8 @@ impl Catalog {
         model: &str,
         version: &str,
     ) -> Result<&Arc<RetargetModel>, ServiceError> {
-        self.robot_for(robot)?;
-        choose(
-            &self.retargeters,
-            "robot with a retargeter",
-            robot,
-            model,
-            version,
-        )
+        let what = "robot with a retargeter";
+        self.choose(&self.retargeters, what, robot, model, version)
     }
 
     /// The policy that a request or a stream's config asks for. Empty `model` and `version` take what there is.
@@ -283,8 +268,8 @@ impl Catalog {
         model: &str,
         version: &str,
     ) -> Result<&Arc<PolicyModel>, ServiceError> {
-        self.robot_for(robot)?;
-        choose(&self.policies, "robot with a policy", robot, model, version)
+        let what = "robot with a policy";
+        self.choose(&self.policies, what, robot, model, version)
     }
 
     /// The EMP that a request or a stream's config asks for. Empty `model` and `version` take what there is.
@@ -294,8 +279,40 @@ impl Catalog {
         model: &str,
         version: &str,
     ) -> Result<&Arc<FilterModel>, ServiceError> {
+        let what = "robot with an EMP";
+        self.choose(&self.filters, what, robot, model, version)
+    }
+
+    /// The model of one kind that a request asks for; `what` is a robot that has one.
+    fn choose<'a, I, O, M>(
+        &self,
+        models: &'a BTreeMap<String, Arc<Served<I, O, M>>>,
+        what: &'static str,
+        robot: &str,
+        model: &str,
+        version: &str,
+    ) -> Result<&'a Arc<Served<I, O, M>>, ServiceError> {
         self.robot_for(robot)?;
-        choose(&self.filters, "robot with an EMP", robot, model, version)
+        let of_robot = || {
+            models
+                .values()
+                .filter(|candidate| candidate.card.robot == robot)
+        };
+        if of_robot().next().is_none() {
+            let served = names(models.values().map(|candidate| &candidate.card.robot));
+            return Err(not_served("robot", what, robot, served));
+        }
+        let chosen = of_robot()
+            .find(|candidate| model.is_empty() || candidate.card.name == model)
+            .ok_or_else(|| {
+                let served = names(of_robot().map(|candidate| &candidate.card.name));
+                not_served("model", "model of this robot", model, served)
+            })?;
+        if !version.is_empty() && chosen.card.version != version {
+            let (what, served) = ("version of this model", chosen.card.version.clone());
+            return Err(not_served("model_version", what, version, served));
+        }
+        Ok(chosen)
     }
 
     /// The robot that a request asks for.
@@ -346,46 +363,21 @@ fn serve<I: Send + 'static, O: Send + 'static, M>(
     })
 }
 
+/// Adds a model and its robot.
+fn insert<I, O, M>(
+    robots: &mut BTreeMap<String, Arc<Robot>>,
+    models: &mut BTreeMap<String, Arc<Served<I, O, M>>>,
+    served: Served<I, O, M>,
+) {
+    robots.insert(served.robot.name().to_owned(), Arc::clone(&served.robot));
+    models.insert(served.card.name.clone(), Arc::new(served));
+}
+
 fn failed<E: Into<BackendError>>(name: &str) -> impl Fn(E) -> CatalogError {
     move |reason| CatalogError::Model {
         name: name.to_owned(),
         reason: reason.into(),
     }
-}
-
-/// The model of one kind that a request asks for.
-fn choose<'a, I, O, M>(
-    models: &'a BTreeMap<String, Arc<Served<I, O, M>>>,
-    what: &'static str,
-    robot: &str,
-    model: &str,
-    version: &str,
-) -> Result<&'a Arc<Served<I, O, M>>, ServiceError> {
-    let of_robot = || {
-        models
-            .values()
-            .filter(|candidate| candidate.card.robot == robot)
-    };
-    if of_robot().next().is_none() {
-        let served = names(models.values().map(|candidate| &candidate.card.robot));
-        return Err(not_served("robot", what, robot, served));
-    }
-    let chosen = of_robot()
-        .find(|candidate| model.is_empty() || candidate.card.name == model)
-        .ok_or_else(|| {
-            let served = names(of_robot().map(|candidate| &candidate.card.name));
-            not_served("model", "model of this robot", model, served)
-        })?;
-    if !version.is_empty() && chosen.card.version != version {
-        let served = chosen.card.version.clone();
-        return Err(not_served(
-            "model_version",
-            "version of this model",
-            version,
-            served,
-        ));
-    }
-    Ok(chosen)
 }
 
 fn not_served(field: &'static str, what: &'static str, name: &str, served: String) -> ServiceError {

@@ -37,6 +37,16 @@ impl FieldError {
         )
     }
 
+    pub(crate) fn missing_frame() -> Self {
+        Self::new("message", "it is missing; expected a frame")
+    }
+
+    /// `number` is not in this enumeration of the contract.
+    pub(crate) fn not_in(enumeration: &str, field: &str, number: i32) -> Self {
+        let description = format!("{number}; expected a value of emp.v1.{enumeration}");
+        Self::new(field, description)
+    }
+
     pub(crate) fn second_config() -> Self {
         Self::new("config", "only the first message may be a config")
     }

@@ -91,8 +91,7 @@ impl Motion {
             refine,
             previous: None,
         };
-        let deadline = due.with_frame(header.as_ref())?;
-        let answer = compute(&model.batcher, input, deadline).await?;
+        let answer = due.compute(&model.batcher, input, header.as_ref()).await?;
         let timing = wire::timing(&answer);
         let result = wire::retarget_result(
             &model.robot,
@@ -130,8 +129,7 @@ impl Motion {
             last_applied,
         };
         let input = past.read(&model.robot, model.model.policy().layout(), mode)?;
-        let deadline = due.with_frame(header.as_ref())?;
-        let answer = compute(&model.batcher, input, deadline).await?;
+        let answer = due.compute(&model.batcher, input, header.as_ref()).await?;
         let timing = wire::timing(&answer);
         let PolicyOutput {
             output, assessment, ..
@@ -166,8 +164,7 @@ impl Motion {
             last_applied,
         };
         let input = past.read(&model.robot, model.model.layout(), mode)?;
-        let deadline = due.with_frame(header.as_ref())?;
-        let answer = compute(&model.batcher, input, deadline).await?;
+        let answer = due.compute(&model.batcher, input, header.as_ref()).await?;
         let timing = wire::timing(&answer);
         let FilterOutput {
             filtered,
@@ -235,31 +232,29 @@ impl Due {
         Ok(Self { received, call })
     }
 
-    /// The call's deadline or the end of the frame's time budget, whichever is sooner.
-    fn with_frame(&self, header: Option<&FrameHeader>) -> Result<Option<Instant>, FieldError> {
+    /// Brings the call's input to its model, until the call's deadline or the end of the frame's time budget, whichever is
+    /// sooner.
+    async fn compute<I: Send + 'static, O: Send + 'static>(
+        &self,
+        batcher: &Batcher<I, O>,
+        input: I,
+        header: Option<&FrameHeader>,
+    ) -> Result<Answer<O>, ServiceError> {
         let frame = deadline::of_frame(header, self.received)?;
-        Ok(deadline::sooner(self.call, frame))
+        let deadline = deadline::sooner(self.call, frame);
+        if deadline::has_passed(deadline) {
+            return Err(ServiceError::DeadlineExceeded);
+        }
+        let ticket = batcher.submit(Priority::Unary, input, deadline)?;
+        let answer = tokio::select! {
+            outcome = ticket => outcome?,
+            () = deadline::passed(deadline) => return Err(ServiceError::DeadlineExceeded),
+        };
+        if deadline::has_passed(deadline) {
+            return Err(ServiceError::DeadlineExceeded);
+        }
+        Ok(answer)
     }
-}
-
-/// Brings the input of a unary call to its model.
-async fn compute<I: Send + 'static, O: Send + 'static>(
-    batcher: &Batcher<I, O>,
-    input: I,
-    deadline: Option<Instant>,
-) -> Result<Answer<O>, ServiceError> {
-    if deadline::has_passed(deadline) {
-        return Err(ServiceError::DeadlineExceeded);
-    }
-    let ticket = batcher.submit(Priority::Unary, input, deadline)?;
-    let answer = tokio::select! {
-        outcome = ticket => outcome?,
-        () = deadline::passed(deadline) => return Err(ServiceError::DeadlineExceeded),
-    };
-    if deadline::has_passed(deadline) {
-        return Err(ServiceError::DeadlineExceeded);
-    }
-    Ok(answer)
 }
 
 /// A session's answers. It holds the stream's place until the transport has let go of it.

@@ -88,10 +88,7 @@ pub(crate) fn read_mode(
         Ok(v1::EmpMode::Off) => EmpMode::Off,
         Ok(v1::EmpMode::On) => EmpMode::On,
         Ok(v1::EmpMode::WhenDanger) => EmpMode::WhenDanger,
-        Err(_) => {
-            let description = format!("{number}; expected a value of emp.v1.EmpMode");
-            return Err(FieldError::new(field, description));
-        }
+        Err(_) => return Err(FieldError::not_in("EmpMode", field, number)),
     };
     if mode != EmpMode::Off && !has_emp {
         let description = "the robot has no EMP here; expected EMP_MODE_OFF";

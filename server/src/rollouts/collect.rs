@@ -19,7 +19,7 @@ use tonic::Streaming;
 
 use super::{
     RolloutContext, blocks,
-    job::{self, Line, Place},
+    job::{self, Line, Place, failed},
     motion, read,
 };
 use crate::{
@@ -231,10 +231,6 @@ async fn read_clips(
         clips.push(made);
     }
     Ok(clips)
-}
-
-fn failed(error: impl std::fmt::Display) -> ServiceError {
-    ServiceError::JobFailed(error.to_string())
 }
 
 fn response(message: Response) -> CollectRolloutsResponse {

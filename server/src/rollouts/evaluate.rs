@@ -19,7 +19,7 @@ use tonic::Streaming;
 
 use super::{
     RolloutContext,
-    job::{self, Line, Place},
+    job::{self, Line, Place, failed},
     motion,
     read::{self, Budget},
     scores,
@@ -139,10 +139,6 @@ fn response(message: Response) -> EvaluateResponse {
     }
 }
 
-fn failed(error: impl std::fmt::Display) -> ServiceError {
-    ServiceError::JobFailed(error.to_string())
-}
-
 /// Reports episodes as they end.
 struct Reporter<'a> {
     line: &'a EvaluateLine,
@@ -223,11 +219,8 @@ fn read_settings(config: &EvaluateConfig, robot: &Robot) -> Result<EvaluationSet
         Ok(Randomization::Unspecified | Randomization::Nominal) => Conditions::Nominal,
         Ok(Randomization::Full) => Conditions::Full,
         Err(_) => {
-            let description = format!(
-                "{}; expected a value of emp.v1.Randomization",
-                config.randomization
-            );
-            return Err(FieldError::new("config.randomization", description));
+            let (field, number) = ("config.randomization", config.randomization);
+            return Err(FieldError::not_in("Randomization", field, number));
         }
     };
     let hand_load = match config.hand_load {

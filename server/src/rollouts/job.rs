@@ -3,6 +3,7 @@
 
 use std::{
     any::Any,
+    fmt::Display,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread,
@@ -190,6 +191,11 @@ fn panicked(payload: &(dyn Any + Send)) -> ServiceError {
         .or_else(|| payload.downcast_ref::<String>().map(String::as_str))
         .unwrap_or("without a message");
     ServiceError::JobFailed(format!("panic: {message}"))
+}
+
+/// A job cannot go on.
+pub(crate) fn failed(error: impl Display) -> ServiceError {
+    ServiceError::JobFailed(error.to_string())
 }
 
 /// Threads that simulate for a job.

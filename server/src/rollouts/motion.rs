@@ -7,7 +7,7 @@ use emp_motion::{Clip, skills};
 use emp_proto::v1::ProceduralClips;
 use emp_sim::goals::{GoalClip, Source};
 
-use super::read;
+use super::{job::failed, read};
 use crate::{
     catalog::RetargetModel,
     error::{FieldError, ServiceError},
@@ -51,8 +51,7 @@ pub(super) fn retarget(
     let mut goals = Vec::with_capacity(clips.len());
     for block in clips.chunks(BLOCK * threads) {
         progress(goals.len())?;
-        let block = GoalClip::retargeted(retargeter, block, source, threads)
-            .map_err(|error| ServiceError::JobFailed(error.to_string()))?;
+        let block = GoalClip::retargeted(retargeter, block, source, threads).map_err(failed)?;
         goals.extend(block);
     }
     Ok(goals)

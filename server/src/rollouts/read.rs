@@ -42,10 +42,7 @@ pub(super) fn source(field: &str, number: i32) -> Result<Source, FieldError> {
     match ClipSource::try_from(number) {
         Ok(ClipSource::Unspecified | ClipSource::Recorded) => Ok(Source::Recorded),
         Ok(ClipSource::Procedural) => Ok(Source::Procedural),
-        Err(_) => Err(FieldError::new(
-            field,
-            format!("{number}; expected a value of emp.v1.ClipSource"),
-        )),
+        Err(_) => Err(FieldError::not_in("ClipSource", field, number)),
     }
 }
 

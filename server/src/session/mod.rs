@@ -145,10 +145,11 @@ async fn converse<K: Kind>(
     mut inbound: Streaming<K::Request>,
     outbound: &mpsc::Sender<Response<K>>,
 ) -> Result<(), ServiceError> {
-    let config = tokio::select! {
-        config = first_message::<K>(&mut inbound) => config?,
-        () = context.drain.cancelled() => return Err(ServiceError::ShuttingDown),
+    let config_of = |message| match K::sort(message) {
+        Some(Incoming::Config(config)) => Some(config),
+        _ => None,
     };
+    let config = read_config(context, &mut inbound, config_of).await?;
     let mut session = Session::<K>::open(context, &config)?;
     let mut end = None;
     loop {
@@ -176,14 +177,18 @@ async fn converse<K: Kind>(
     }
 }
 
-async fn first_message<K: Kind>(
-    inbound: &mut Streaming<K::Request>,
-) -> Result<K::Config, ServiceError> {
-    let message = inbound.message().await.map_err(ServiceError::Transport)?;
-    match message.and_then(K::sort) {
-        Some(Incoming::Config(config)) => Ok(config),
-        _ => Err(FieldError::missing_config().into()),
-    }
+/// The config of a stream, which its first message holds.
+pub(crate) async fn read_config<T, C>(
+    context: &SessionContext,
+    inbound: &mut Streaming<T>,
+    config_of: impl FnOnce(T) -> Option<C>,
+) -> Result<C, ServiceError> {
+    let message = tokio::select! {
+        message = inbound.message() => message.map_err(ServiceError::Transport)?,
+        () = context.drain.cancelled() => return Err(ServiceError::ShuttingDown),
+    };
+    let config = message.and_then(config_of);
+    config.ok_or_else(|| FieldError::missing_config().into())
 }
 
 /// Waits for the frame that is with the model; forever if there is none.
@@ -256,18 +261,13 @@ impl<K: Kind> Session<K> {
         let frame = match K::sort(message) {
             Some(Incoming::Frame(frame)) => frame,
             Some(Incoming::Config(_)) => return Err(FieldError::second_config().into()),
-            None => {
-                return Err(FieldError::new("message", "it is missing; expected a frame").into());
-            }
+            None => return Err(FieldError::missing_frame().into()),
         };
         let header = K::header(&frame);
         match (self.read_frame(header, frame), self.delivery) {
             (Ok(frame), Delivery::Latest) => self.accept_latest(frame),
             (Ok(frame), _) => self.waiting.push_back(Waiting::Frame(frame)),
-            (Err(error), Delivery::Latest) => {
-                self.outbox
-                    .push_back(K::dropped(NotComputed::from(error).notice(header)));
-            }
+            (Err(error), Delivery::Latest) => self.drop_frame(header, error.into()),
             (Err(error), _) => self
                 .waiting
                 .push_back(Waiting::Notice(NotComputed::from(error).notice(header))),
@@ -380,9 +380,6 @@ pub(crate) fn read_delivery(number: i32) -> Result<Delivery, FieldError> {
     match Delivery::try_from(number) {
         Ok(Delivery::Unspecified | Delivery::All) => Ok(Delivery::All),
         Ok(Delivery::Latest) => Ok(Delivery::Latest),
-        Err(_) => Err(FieldError::new(
-            "config.delivery",
-            format!("{number}; expected a value of emp.v1.Delivery"),
-        )),
+        Err(_) => Err(FieldError::not_in("Delivery", "config.delivery", number)),
     }
 }

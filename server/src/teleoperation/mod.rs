@@ -55,10 +55,10 @@ impl Role {
             Ok(TeleoperationRole::Operator) => Ok(Self::Operator),
             Ok(TeleoperationRole::Robot) => Ok(Self::Robot),
             Ok(TeleoperationRole::Observer) => Ok(Self::Observer),
-            Err(_) => Err(FieldError::new(
-                "config.role",
-                format!("{number}; expected a value of emp.v1.TeleoperationRole"),
-            )),
+            Err(_) => {
+                let field = "config.role";
+                Err(FieldError::not_in("TeleoperationRole", field, number))
+            }
         }
     }
 
@@ -95,10 +95,11 @@ async fn converse(
     mut inbound: Streaming<TeleoperateRequest>,
     outbound: &Outbound,
 ) -> Result<(), ServiceError> {
-    let config = tokio::select! {
-        config = first_message(&mut inbound) => config?,
-        () = context.drain.cancelled() => return Err(ServiceError::ShuttingDown),
+    let config_of = |message: TeleoperateRequest| match message.message {
+        Some(Request::Config(config)) => Some(config),
+        _ => None,
     };
+    let config = session::read_config(context, &mut inbound, config_of).await?;
     let joined = Joined::open(context, teleoperation, &config)?;
     // Whoever listens hears everything from the presence in `started` on.
     let told = joined.member.listen();
@@ -116,25 +117,12 @@ async fn converse(
     robot::run(context, &joined, delivery, path, inbound, outbound).await
 }
 
-async fn first_message(
-    inbound: &mut Streaming<TeleoperateRequest>,
-) -> Result<TeleoperateConfig, ServiceError> {
-    let message = inbound.message().await.map_err(ServiceError::Transport)?;
-    match message.and_then(|request| request.message) {
-        Some(Request::Config(config)) => Ok(config),
-        _ => Err(FieldError::missing_config().into()),
-    }
-}
-
 /// The frame in a message that is not the first.
 fn frame_of(request: TeleoperateRequest) -> Result<TeleoperationFrame, FieldError> {
     match request.message {
         Some(Request::Frame(frame)) => Ok(frame),
         Some(Request::Config(_)) => Err(FieldError::second_config()),
-        None => Err(FieldError::new(
-            "message",
-            "it is missing; expected a frame",
-        )),
+        None => Err(FieldError::missing_frame()),
     }
 }
 

@@ -70,8 +70,9 @@ impl Client {
     /// # Errors
     /// When the call fails.
     pub async fn models(&self) -> Result<Vec<Model>, ClientError> {
-        let response = self.model_service().list_models(ListModelsRequest {}).await;
-        Ok(response.map_err(ClientError::Status)?.into_inner().models)
+        let mut service = self.model_service();
+        let response = service.list_models(ListModelsRequest {}).await?;
+        Ok(response.into_inner().models)
     }
 
     /// One model.
@@ -79,13 +80,10 @@ impl Client {
     /// # Errors
     /// When the call fails, with `NOT_FOUND` for an unknown name.
     pub async fn model(&self, name: &str) -> Result<Model, ClientError> {
-        let response = self
-            .model_service()
-            .get_model(GetModelRequest {
-                name: name.to_owned(),
-            })
-            .await;
-        let model = response.map_err(ClientError::Status)?.into_inner().model;
+        let name = name.to_owned();
+        let mut service = self.model_service();
+        let response = service.get_model(GetModelRequest { name }).await?;
+        let model = response.into_inner().model;
         model.ok_or(ClientError::Contract("GetModel without a model"))
     }
 
@@ -94,13 +92,10 @@ impl Client {
     /// # Errors
     /// When the call fails, with `NOT_FOUND` for an unknown name.
     pub async fn robot(&self, name: &str) -> Result<Robot, ClientError> {
-        let response = self
-            .model_service()
-            .get_robot(GetRobotRequest {
-                name: name.to_owned(),
-            })
-            .await;
-        let robot = response.map_err(ClientError::Status)?.into_inner().robot;
+        let name = name.to_owned();
+        let mut service = self.model_service();
+        let response = service.get_robot(GetRobotRequest { name }).await?;
+        let robot = response.into_inner().robot;
         robot.ok_or(ClientError::Contract("GetRobot without a robot"))
     }
 
@@ -122,12 +117,12 @@ impl Client {
             ..RetargetRequest::default()
         };
         let sent = Instant::now();
-        let response = self.motion_service().retarget(request).await;
-        let response = response.map_err(ClientError::Status)?.into_inner();
+        let response = self.motion_service().retarget(request).await?.into_inner();
         let result = response
             .result
             .ok_or(ClientError::Contract("Retarget without a result"))?;
-        Ok(wire::answer(0, result, response.timing, sent.elapsed()))
+        let times = wire::times(response.timing, sent.elapsed());
+        Ok(wire::answer(0, result, times))
     }
 
     /// Opens a stream of poses. A lost connection is restored with backoff: with delivery `ALL` whatever was not answered
@@ -163,17 +158,13 @@ impl Client {
             last_applied: history.last_applied,
         };
         let sent = Instant::now();
-        let response = self.motion_service().filter_goal(request).await;
-        let response = response.map_err(ClientError::Status)?.into_inner();
+        let mut service = self.motion_service();
+        let response = service.filter_goal(request).await?.into_inner();
         let result = response
             .result
             .ok_or(ClientError::Contract("FilterGoal without a result"))?;
-        Ok(wire::filter_answer(
-            0,
-            result,
-            response.timing,
-            sent.elapsed(),
-        ))
+        let times = wire::times(response.timing, sent.elapsed());
+        Ok(wire::filter_answer(0, result, times))
     }
 
     /// Opens a stream of goals to filter, one a control period, for a robot whose legs the program moves itself. The first

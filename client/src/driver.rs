@@ -3,16 +3,13 @@
 use std::{collections::VecDeque, time::Instant};
 
 use emp_proto::v1::{Delivery, motion_service_client::MotionServiceClient};
-use tokio::{
-    sync::mpsc,
-    time::{sleep_until, timeout},
-};
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming, transport::Channel};
+use tokio::{sync::mpsc, time::sleep_until};
+use tonic::{Status, transport::Channel};
 
 use crate::{
     Backoff, ClientError, DropCause, Dropped, Event, FrameSender, StreamEvents,
     backoff::Break,
+    connection::{self, Attempt, Attempts, EVENTS, End, HAND_OVER},
     kind::{Incoming, Kind, Started},
     stream::Outbound,
     wire,
@@ -20,12 +17,6 @@ use crate::{
 
 /// Most frames without an answer.
 const WINDOW: usize = 64;
-/// Frames between the program and the driver, and between the driver and the transport.
-const HAND_OVER: usize = 4;
-/// Events that wait for the program.
-const EVENTS: usize = 256;
-/// How long a server may take to accept a stream.
-const OPEN_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(10);
 
 /// Opens a stream and starts its driver.
 pub(crate) async fn start<K: Kind>(
@@ -69,38 +60,18 @@ pub(crate) async fn start<K: Kind>(
 }
 
 /// One call.
-struct Connection<K: Kind> {
-    /// None once half-closed.
-    requests: Option<mpsc::Sender<K::Request>>,
-    responses: Streaming<K::Response>,
-}
+type Connection<K> = connection::Connection<<K as Kind>::Request, <K as Kind>::Response>;
 
 async fn open<K: Kind>(
     service: &MotionServiceClient<Channel>,
     config: &K,
 ) -> Result<(Connection<K>, Started), Break> {
-    let (requests, outbound) = mpsc::channel(HAND_OVER);
-    let opening = async {
-        // The channel is new and has room.
-        let _ = requests.send(config.first()).await;
-        let call = K::call(service.clone(), ReceiverStream::new(outbound));
-        let mut responses = call.await?;
-        match responses.message().await?.and_then(K::sort) {
-            Some(Incoming::Started(started)) => Ok((
-                Connection {
-                    requests: Some(requests),
-                    responses,
-                },
-                started,
-            )),
-            _ => Err(Break::Silence("the stream ended before it was accepted")),
-        }
+    let call = |requests| K::call(service.clone(), requests);
+    let started = |response| match K::sort(response) {
+        Some(Incoming::Started(started)) => Some(started),
+        _ => None,
     };
-    timeout(OPEN_TIMEOUT, opening).await.unwrap_or_else(|_| {
-        Err(Break::Silence(
-            "the server did not accept the stream in time",
-        ))
-    })
+    connection::open(config.first(), call, started).await
 }
 
 /// A frame without an answer.
@@ -125,18 +96,6 @@ struct Driver<K: Kind> {
     unsent: usize,
 }
 
-/// Why a connection's turn is over.
-enum End {
-    /// Every frame has its answer, and the program sends no more.
-    Finished,
-    /// The program let go of its events.
-    Abandoned,
-    /// The connection or the server ended it.
-    Broken(Break),
-    /// The stream cannot go on.
-    Failed(ClientError),
-}
-
 /// What happens next on a connection.
 enum Step<K: Kind> {
     /// The next frame went out, or found the transport gone.
@@ -148,26 +107,18 @@ enum Step<K: Kind> {
 
 impl<K: Kind> Driver<K> {
     async fn run(mut self, mut connection: Connection<K>) {
-        loop {
-            let end = self.converse(connection).await;
-            let end = match end {
+        let end = loop {
+            match self.converse(connection).await {
                 End::Broken(end) if end.is_worth_retrying() => match self.reconnect(end).await {
-                    Ok(new) => {
-                        connection = new;
-                        continue;
-                    }
-                    Err(end) => end,
+                    Ok(new) => connection = new,
+                    Err(end) => break end,
                 },
-                end => end,
-            };
-            let error = match end {
-                End::Finished | End::Abandoned => return,
-                End::Broken(end) => end.into(),
-                End::Failed(error) => error,
-            };
+                end => break end,
+            }
+        };
+        if let Some(error) = end.error() {
             // Whoever let go of the events does not want to know.
             let _ = self.events.send(Err(error)).await;
-            return;
         }
     }
 
@@ -190,31 +141,38 @@ impl<K: Kind> Driver<K> {
                 Step::Sent(false) => connection.requests = None,
                 Step::Frame(Some(frame)) => self.window.push_back(unanswered(frame)),
                 Step::Frame(None) => self.sending = false,
-                Step::Response(Ok(Some(response))) => match self.event(response) {
-                    Ok(event) => {
-                        if !self.tell(event).await {
-                            return End::Abandoned;
-                        }
+                Step::Response(Ok(Some(response))) => {
+                    if let Err(end) = self.take(response).await {
+                        return end;
                     }
-                    Err(error) => return End::Failed(error),
-                },
+                }
                 Step::Response(Ok(None)) if !self.sending && self.window.is_empty() => {
                     return End::Finished;
                 }
-                Step::Response(Ok(None)) => {
-                    return End::Broken(Break::Silence("the server ended the stream early"));
-                }
+                Step::Response(Ok(None)) => return End::early(),
                 Step::Response(Err(status)) => return End::Broken(status.into()),
             }
         }
     }
 
+    /// Takes a message and tells the program of it.
+    async fn take(&mut self, response: K::Response) -> Result<(), End> {
+        let event = self.event(response).map_err(End::Failed)?;
+        self.tell(event).await
+    }
+
     /// Takes an answered or dropped frame out of the window.
     fn event(&mut self, response: K::Response) -> Result<Event<K::Answer>, ClientError> {
         match K::sort(response) {
-            Some(Incoming::Result { number, message }) => {
+            Some(Incoming::Result {
+                number,
+                result,
+                timing,
+            }) => {
                 let first_sent = self.settle(number)?;
-                let answer = K::answer(number, message, first_sent.elapsed())?;
+                let result = result.ok_or(ClientError::Contract("an answer without a result"))?;
+                let times = wire::times(timing, first_sent.elapsed());
+                let answer = K::answer(number, result, times);
                 Ok(Event::Answer(answer))
             }
             Some(Incoming::Dropped(message)) => {
@@ -223,9 +181,7 @@ impl<K: Kind> Driver<K> {
                 Ok(Event::Dropped(dropped))
             }
             Some(Incoming::Started(_)) => Err(ClientError::Contract("a stream that starts twice")),
-            None => Err(ClientError::Contract(
-                "a message without content; is the server newer?",
-            )),
+            None => Err(ClientError::EMPTY_MESSAGE),
         }
     }
 
@@ -244,62 +200,46 @@ impl<K: Kind> Driver<K> {
     }
 
     /// Restores the connection, or says why it cannot be.
-    async fn reconnect(&mut self, mut last: Break) -> Result<Connection<K>, End> {
-        let start = Instant::now();
+    async fn reconnect(&mut self, last: Break) -> Result<Connection<K>, End> {
         self.unsent = 0;
-        for attempt in 1.. {
-            let retry_in = self.backoff.pause(attempt, &last);
-            let reason = last.reason().to_owned();
-            if start.elapsed() + retry_in > self.backoff.give_up {
-                let seconds = start.elapsed().as_secs_f64();
-                return Err(End::Failed(ClientError::Lost {
-                    seconds,
-                    last: reason,
-                }));
-            }
-            if !self
-                .tell(Event::ConnectionLost {
-                    reason,
-                    attempt,
-                    retry_in,
-                })
-                .await
-                || !self.wait(Instant::now() + retry_in).await
-            {
-                return Err(End::Abandoned);
-            }
+        let mut attempts = Attempts::after(last, self.backoff);
+        loop {
+            let Attempt {
+                reason,
+                number,
+                retry_in,
+            } = attempts.another()?;
+            self.tell(Event::ConnectionLost {
+                reason,
+                attempt: number,
+                retry_in,
+            })
+            .await?;
+            self.wait(Instant::now() + retry_in).await?;
             match open(&self.service, &self.config).await {
                 Ok((_, started)) if started.joint_names != self.joint_names => {
-                    let what = "the server came back with other joints";
-                    return Err(End::Failed(ClientError::Contract(what)));
+                    return Err(End::contract("the server came back with other joints"));
                 }
                 Ok((connection, _)) => {
                     let resent = self.window.len();
-                    return if self.tell(Event::Reconnected { resent }).await {
-                        Ok(connection)
-                    } else {
-                        Err(End::Abandoned)
-                    };
+                    self.tell(Event::Reconnected { resent }).await?;
+                    return Ok(connection);
                 }
-                Err(end) if end.is_worth_retrying_again() => last = end,
-                Err(end) => return Err(End::Broken(end)),
+                Err(why) => attempts.failed(why)?,
             }
         }
-        Err(End::Broken(last))
     }
 
     /// Waits for the next attempt. With `LATEST` whatever is unanswered or sent meanwhile is dropped: it would be stale.
-    async fn wait(&mut self, until: Instant) -> bool {
+    async fn wait(&mut self, until: Instant) -> Result<(), End> {
         let latest = self.config.delivery() == Delivery::Latest;
         loop {
             while latest && let Some(frame) = self.window.pop_front() {
-                if !self.tell(lost(frame.number)).await {
-                    return false;
-                }
+                self.tell(lost(frame.number)).await?;
             }
             tokio::select! {
-                () = sleep_until(until.into()) => return true,
-                () = self.events.closed() => return false,
+                () = sleep_until(until.into()) => return Ok(()),
+                () = self.events.closed() => return Err(End::Abandoned),
                 frame = self.frames.recv(), if latest && self.sending => match frame {
                     Some(frame) => self.window.push_back(unanswered(frame)),
                     None => self.sending = false,
@@ -308,9 +248,10 @@ impl<K: Kind> Driver<K> {
         }
     }
 
-    /// Hands an event to the program; false when it let go.
-    async fn tell(&self, event: Event<K::Answer>) -> bool {
-        self.events.send(Ok(event)).await.is_ok()
+    /// Hands an event to the program.
+    async fn tell(&self, event: Event<K::Answer>) -> Result<(), End> {
+        let sent = self.events.send(Ok(event)).await;
+        sent.map_err(|_| End::Abandoned)
     }
 }
 

@@ -34,6 +34,10 @@ pub enum ClientError {
 }
 
 impl ClientError {
+    /// A message whose kind this client does not know.
+    pub(crate) const EMPTY_MESSAGE: Self =
+        Self::Contract("a message without content; is the server newer?");
+
     /// The code, where the server answered with a status.
     pub fn code(&self) -> Option<Code> {
         match self {
@@ -48,6 +52,12 @@ impl ClientError {
             Self::Status(status) => status.get_details_error_info().map(|info| info.reason),
             _ => None,
         }
+    }
+}
+
+impl From<Status> for ClientError {
+    fn from(status: Status) -> Self {
+        Self::Status(status)
     }
 }
 

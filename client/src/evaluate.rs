@@ -10,13 +10,14 @@ use emp_client::{
     GoalStatistics, MassRange, Metric, ProceduralClips, Push, Randomization, Spread,
 };
 use emp_motion::Clip;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 use tempfile::NamedTempFile;
 
-use crate::cli::{self, Evaluate};
-
-const INTERRUPTED: u8 = 130;
+use crate::{
+    cli::{self, Evaluate},
+    command::{INTERRUPTED, progress_bar},
+};
 
 /// How an evaluation ended.
 enum End {
@@ -117,7 +118,7 @@ fn config(command: &Evaluate) -> EvaluateConfig {
 }
 
 async fn follow(evaluation: &mut Evaluation, outcome: &mut Outcome) -> End {
-    let bar = progress_bar();
+    let bar = progress_bar(None, "{bar:40} {pos}/{len} {msg}  {eta} left");
     let interrupt = tokio::signal::ctrl_c();
     tokio::pin!(interrupt);
     let end = loop {
@@ -138,15 +139,6 @@ async fn follow(evaluation: &mut Evaluation, outcome: &mut Outcome) -> End {
     };
     bar.finish_and_clear();
     end
-}
-
-/// A bar on standard error, if that is a terminal.
-fn progress_bar() -> ProgressBar {
-    let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
-    match ProgressStyle::with_template("{bar:40} {pos}/{len} {msg}  {eta} left") {
-        Ok(style) => bar.with_style(style),
-        Err(_) => bar,
-    }
 }
 
 impl Outcome {

@@ -1,12 +1,12 @@
 //! The kinds of streams: their messages and the call behind them. All else about a stream is the driver's.
 
-use std::{future::Future, time::Duration};
+use std::future::Future;
 
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{
-    Delivery, DroppedFrame, FilteredFrame, FrameHeader, RetargetFrame, RetargetedFrame,
-    SteppedFrame, StreamFilterGoalRequest, StreamFilterGoalResponse, StreamPolicyRequest,
-    StreamPolicyResponse, StreamRetargetRequest, StreamRetargetResponse,
+    Delivery, DroppedFrame, FilterResult, FrameHeader, PolicyResult, RetargetFrame, RetargetResult,
+    StreamFilterGoalRequest, StreamFilterGoalResponse, StreamPolicyRequest, StreamPolicyResponse,
+    StreamRetargetRequest, StreamRetargetResponse, Timing,
     motion_service_client::MotionServiceClient, stream_filter_goal_request,
     stream_filter_goal_response, stream_policy_request, stream_policy_response,
     stream_retarget_request, stream_retarget_response,
@@ -15,7 +15,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming, transport::Channel};
 
 use crate::{
-    Answer, ClientError, FilterAnswer, FilterConfig, GoalFrame, PolicyAnswer, PolicyConfig,
+    Answer, AnswerTimes, FilterAnswer, FilterConfig, GoalFrame, PolicyAnswer, PolicyConfig,
     RobotFrame, StreamConfig, wire,
 };
 
@@ -25,7 +25,7 @@ pub(crate) trait Kind: Clone + Send + Sync + 'static {
     type Answer: Send + 'static;
     type Request: Clone + Send + Sync + 'static;
     type Response: Send + 'static;
-    /// The message that answers a frame.
+    /// What answers a frame.
     type Result;
 
     /// The first message.
@@ -42,17 +42,17 @@ pub(crate) trait Kind: Clone + Send + Sync + 'static {
 
     fn sort(response: Self::Response) -> Option<Incoming<Self>>;
 
-    fn answer(
-        number: u64,
-        message: Self::Result,
-        latency: Duration,
-    ) -> Result<Self::Answer, ClientError>;
+    fn answer(number: u64, result: Self::Result, times: AnswerTimes) -> Self::Answer;
 }
 
 /// A message from the server.
 pub(crate) enum Incoming<K: Kind> {
     Started(Started),
-    Result { number: u64, message: K::Result },
+    Result {
+        number: u64,
+        result: Option<K::Result>,
+        timing: Option<Timing>,
+    },
     Dropped(DroppedFrame),
 }
 
@@ -72,13 +72,11 @@ impl Kind for StreamConfig {
     type Answer = Answer;
     type Request = StreamRetargetRequest;
     type Response = StreamRetargetResponse;
-    type Result = RetargetedFrame;
+    type Result = RetargetResult;
 
     fn first(&self) -> StreamRetargetRequest {
-        let message = stream_retarget_request::Message::Config(self.message());
-        StreamRetargetRequest {
-            message: Some(message),
-        }
+        let message = Some(stream_retarget_request::Message::Config(self.message()));
+        StreamRetargetRequest { message }
     }
 
     fn delivery(&self) -> Delivery {
@@ -90,9 +88,8 @@ impl Kind for StreamConfig {
             header: Some(header),
             pose: Some(wire::pose(frame)),
         };
-        StreamRetargetRequest {
-            message: Some(stream_retarget_request::Message::Frame(frame)),
-        }
+        let message = Some(stream_retarget_request::Message::Frame(frame));
+        StreamRetargetRequest { message }
     }
 
     async fn call(
@@ -112,21 +109,15 @@ impl Kind for StreamConfig {
             }),
             Message::Result(message) => Incoming::Result {
                 number: number(message.header),
-                message,
+                result: message.result,
+                timing: message.timing,
             },
             Message::Dropped(message) => Incoming::Dropped(message),
         })
     }
 
-    fn answer(
-        number: u64,
-        message: RetargetedFrame,
-        latency: Duration,
-    ) -> Result<Answer, ClientError> {
-        let result = message
-            .result
-            .ok_or(ClientError::Contract("an answer without a result"))?;
-        Ok(wire::answer(number, result, message.timing, latency))
+    fn answer(number: u64, result: RetargetResult, times: AnswerTimes) -> Answer {
+        wire::answer(number, result, times)
     }
 }
 
@@ -135,13 +126,11 @@ impl Kind for PolicyConfig {
     type Answer = PolicyAnswer;
     type Request = StreamPolicyRequest;
     type Response = StreamPolicyResponse;
-    type Result = SteppedFrame;
+    type Result = PolicyResult;
 
     fn first(&self) -> StreamPolicyRequest {
-        let message = stream_policy_request::Message::Config(self.message());
-        StreamPolicyRequest {
-            message: Some(message),
-        }
+        let message = Some(stream_policy_request::Message::Config(self.message()));
+        StreamPolicyRequest { message }
     }
 
     fn delivery(&self) -> Delivery {
@@ -150,9 +139,8 @@ impl Kind for PolicyConfig {
 
     fn frame(header: FrameHeader, frame: &RobotFrame) -> StreamPolicyRequest {
         let frame = wire::robot_frame(header, frame);
-        StreamPolicyRequest {
-            message: Some(stream_policy_request::Message::Frame(frame)),
-        }
+        let message = Some(stream_policy_request::Message::Frame(frame));
+        StreamPolicyRequest { message }
     }
 
     async fn call(
@@ -172,21 +160,15 @@ impl Kind for PolicyConfig {
             }),
             Message::Result(message) => Incoming::Result {
                 number: number(message.header),
-                message,
+                result: message.result,
+                timing: message.timing,
             },
             Message::Dropped(message) => Incoming::Dropped(message),
         })
     }
 
-    fn answer(
-        number: u64,
-        message: SteppedFrame,
-        latency: Duration,
-    ) -> Result<PolicyAnswer, ClientError> {
-        let result = message
-            .result
-            .ok_or(ClientError::Contract("an answer without a result"))?;
-        Ok(wire::policy_answer(number, result, message.timing, latency))
+    fn answer(number: u64, result: PolicyResult, times: AnswerTimes) -> PolicyAnswer {
+        wire::policy_answer(number, result, times)
     }
 }
 
@@ -195,13 +177,11 @@ impl Kind for FilterConfig {
     type Answer = FilterAnswer;
     type Request = StreamFilterGoalRequest;
     type Response = StreamFilterGoalResponse;
-    type Result = FilteredFrame;
+    type Result = FilterResult;
 
     fn first(&self) -> StreamFilterGoalRequest {
-        let message = stream_filter_goal_request::Message::Config(self.message());
-        StreamFilterGoalRequest {
-            message: Some(message),
-        }
+        let message = Some(stream_filter_goal_request::Message::Config(self.message()));
+        StreamFilterGoalRequest { message }
     }
 
     fn delivery(&self) -> Delivery {
@@ -210,9 +190,8 @@ impl Kind for FilterConfig {
 
     fn frame(header: FrameHeader, frame: &GoalFrame) -> StreamFilterGoalRequest {
         let frame = wire::goal_frame(header, frame);
-        StreamFilterGoalRequest {
-            message: Some(stream_filter_goal_request::Message::Frame(frame)),
-        }
+        let message = Some(stream_filter_goal_request::Message::Frame(frame));
+        StreamFilterGoalRequest { message }
     }
 
     async fn call(
@@ -232,20 +211,14 @@ impl Kind for FilterConfig {
             }),
             Message::Result(message) => Incoming::Result {
                 number: number(message.header),
-                message,
+                result: message.result,
+                timing: message.timing,
             },
             Message::Dropped(message) => Incoming::Dropped(message),
         })
     }
 
-    fn answer(
-        number: u64,
-        message: FilteredFrame,
-        latency: Duration,
-    ) -> Result<FilterAnswer, ClientError> {
-        let result = message
-            .result
-            .ok_or(ClientError::Contract("an answer without a result"))?;
-        Ok(wire::filter_answer(number, result, message.timing, latency))
+    fn answer(number: u64, result: FilterResult, times: AnswerTimes) -> FilterAnswer {
+        wire::filter_answer(number, result, times)
     }
 }

@@ -31,6 +31,7 @@
 
 mod backoff;
 mod client;
+mod connection;
 mod driver;
 mod error;
 mod kind;

@@ -1,30 +1,21 @@
 //! The task behind an operator's or an observer's stream: it passes poses on and tells what the session tells, and carries
 //! both over lost connections.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use emp_proto::v1::{
     TeleoperateRequest, TeleoperateResponse, TeleoperationRole, TeleoperationStarted,
     motion_service_client::MotionServiceClient, teleoperate_response::Message,
 };
-use tokio::{
-    sync::mpsc,
-    time::{sleep_until, timeout},
-};
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming, transport::Channel};
+use tokio::{sync::mpsc, time::sleep_until};
+use tonic::{Status, transport::Channel};
 
 use crate::{
     Backoff, ClientError, PoseSender, SessionEvent, SessionEvents, TeleoperationConfig,
-    backoff::Break, teleoperation, wire,
+    backoff::Break,
+    connection::{self, Attempt, Attempts, EVENTS, End, HAND_OVER},
+    teleoperation, wire,
 };
-
-/// Poses between the program and the transport.
-const HAND_OVER: usize = 4;
-/// Events that wait for the program.
-const EVENTS: usize = 256;
-/// How long a server may take to accept a stream.
-const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Joins a session and starts the stream's driver.
 pub(crate) async fn start(
@@ -53,11 +44,7 @@ pub(crate) async fn start(
 }
 
 /// One call.
-struct Connection {
-    /// None once half-closed.
-    requests: Option<mpsc::Sender<TeleoperateRequest>>,
-    responses: Streaming<TeleoperateResponse>,
-}
+type Connection = connection::Connection<TeleoperateRequest, TeleoperateResponse>;
 
 struct Listener {
     service: MotionServiceClient<Channel>,
@@ -68,65 +55,29 @@ struct Listener {
     events: mpsc::Sender<Result<SessionEvent, ClientError>>,
 }
 
-/// Why a connection's turn is over.
-enum End {
-    /// The operator left, and the server has said all.
-    Finished,
-    /// The program let go of its events.
-    Abandoned,
-    /// The connection or the server ended it.
-    Broken(Break),
-    /// The stream cannot go on.
-    Failed(ClientError),
-}
-
 impl Listener {
     async fn open(&self) -> Result<(Connection, TeleoperationStarted), Break> {
-        let (requests, outbound) = mpsc::channel(HAND_OVER);
-        let opening = async {
-            // The channel is new and has room.
-            let _ = requests.send(self.config.request(self.role)).await;
-            let call = teleoperation::call(self.service.clone(), ReceiverStream::new(outbound));
-            let mut responses = call.await?;
-            let first = responses.message().await?;
-            match first.and_then(|response| response.message) {
-                Some(Message::Started(started)) => Ok((
-                    Connection {
-                        requests: Some(requests),
-                        responses,
-                    },
-                    started,
-                )),
-                _ => Err(Break::Silence("the stream ended before it was accepted")),
-            }
+        let call = |requests| teleoperation::call(self.service.clone(), requests);
+        let started = |response: TeleoperateResponse| match response.message {
+            Some(Message::Started(started)) => Some(started),
+            _ => None,
         };
-        timeout(OPEN_TIMEOUT, opening).await.unwrap_or_else(|_| {
-            Err(Break::Silence(
-                "the server did not accept the stream in time",
-            ))
-        })
+        connection::open(self.config.request(self.role), call, started).await
     }
 
     async fn run(mut self, mut connection: Connection) {
-        loop {
-            let end = match self.converse(connection).await {
+        let end = loop {
+            match self.converse(connection).await {
                 End::Broken(end) if end.is_worth_retrying() => match self.reconnect(end).await {
-                    Ok(new) => {
-                        connection = new;
-                        continue;
-                    }
-                    Err(end) => end,
+                    Ok(new) => connection = new,
+                    Err(end) => break end,
                 },
-                end => end,
-            };
-            let error = match end {
-                End::Finished | End::Abandoned => return,
-                End::Broken(end) => end.into(),
-                End::Failed(error) => error,
-            };
+                end => break end,
+            }
+        };
+        if let Some(error) = end.error() {
             // Whoever let go of the events does not want to know.
             let _ = self.events.send(Err(error)).await;
-            return;
         }
     }
 
@@ -149,15 +100,15 @@ impl Listener {
                     continue;
                 }
             };
-            match self.tell(response, connection.requests.is_none()).await {
-                Ok(()) => {}
-                Err(end) => return end,
+            let has_left = connection.requests.is_none();
+            if let Err(end) = self.take(response, has_left).await {
+                return end;
             }
         }
     }
 
-    /// Hands a message to the program.
-    async fn tell(
+    /// Takes a message and tells the program of it.
+    async fn take(
         &self,
         response: Result<Option<TeleoperateResponse>, Status>,
         has_left: bool,
@@ -165,62 +116,52 @@ impl Listener {
         let message = match response {
             Ok(Some(response)) => response.message,
             Ok(None) if has_left => return Err(End::Finished),
-            Ok(None) => {
-                let silence = Break::Silence("the server ended the stream early");
-                return Err(End::Broken(silence));
-            }
+            Ok(None) => return Err(End::early()),
             Err(status) => return Err(End::Broken(status.into())),
         };
         let event = match message {
             Some(Message::Result(result)) => SessionEvent::Executed(Box::new(result)),
             Some(Message::Presence(presence)) => SessionEvent::Presence(presence),
             Some(Message::Dropped(dropped)) => SessionEvent::Dropped(wire::dropped(dropped)),
-            Some(Message::Started(_)) => return Err(broken_contract("a stream that starts twice")),
-            None => {
-                let what = "a message without content; is the server newer?";
-                return Err(broken_contract(what));
-            }
+            Some(Message::Started(_)) => return Err(End::contract("a stream that starts twice")),
+            None => return Err(End::Failed(ClientError::EMPTY_MESSAGE)),
         };
-        self.pass_on(event).await
+        self.tell(event).await
     }
 
-    async fn pass_on(&self, event: SessionEvent) -> Result<(), End> {
+    /// Hands an event to the program.
+    async fn tell(&self, event: SessionEvent) -> Result<(), End> {
         let sent = self.events.send(Ok(event)).await;
         sent.map_err(|_| End::Abandoned)
     }
 
     /// Restores the connection, or says why it cannot be.
-    async fn reconnect(&mut self, mut last: Break) -> Result<Connection, End> {
-        let start = Instant::now();
-        for attempt in 1.. {
-            let retry_in = self.backoff.pause(attempt, &last);
-            let reason = last.reason().to_owned();
-            if start.elapsed() + retry_in > self.backoff.give_up {
-                return Err(End::Failed(ClientError::Lost {
-                    seconds: start.elapsed().as_secs_f64(),
-                    last: reason,
-                }));
-            }
-            self.pass_on(SessionEvent::ConnectionLost {
+    async fn reconnect(&mut self, last: Break) -> Result<Connection, End> {
+        let mut attempts = Attempts::after(last, self.backoff);
+        loop {
+            let Attempt {
                 reason,
-                attempt,
+                number,
+                retry_in,
+            } = attempts.another()?;
+            self.tell(SessionEvent::ConnectionLost {
+                reason,
+                attempt: number,
                 retry_in,
             })
             .await?;
             self.wait(Instant::now() + retry_in).await?;
             match self.open().await {
                 Ok((connection, started)) => {
-                    self.pass_on(SessionEvent::Reconnected).await?;
+                    self.tell(SessionEvent::Reconnected).await?;
                     if let Some(presence) = started.presence {
-                        self.pass_on(SessionEvent::Presence(presence)).await?;
+                        self.tell(SessionEvent::Presence(presence)).await?;
                     }
                     return Ok(connection);
                 }
-                Err(end) if end.is_worth_retrying_again() => last = end,
-                Err(end) => return Err(End::Broken(end)),
+                Err(why) => attempts.failed(why)?,
             }
         }
-        Err(End::Broken(last))
     }
 
     /// Waits for the next attempt. Poses that are sent meanwhile would be stale.
@@ -237,8 +178,4 @@ impl Listener {
             }
         }
     }
-}
-
-fn broken_contract(what: &'static str) -> End {
-    End::Failed(ClientError::Contract(what))
 }

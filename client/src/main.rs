@@ -3,6 +3,7 @@
 #![forbid(unsafe_code)]
 
 mod cli;
+mod command;
 mod evaluate;
 mod report;
 mod retarget;

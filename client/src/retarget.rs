@@ -8,12 +8,14 @@ use emp_client::{
     StreamEvents, Summary,
 };
 use emp_motion::{Clip, joint_csv::JointCsvWriter};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 use tokio::time::MissedTickBehavior;
 
-use crate::cli::Retarget;
+use crate::{
+    cli::Retarget,
+    command::{self, INTERRUPTED, progress_bar},
+};
 
-const INTERRUPTED: u8 = 130;
 const FRAMES_MISSING: u8 = 3;
 
 /// How a stream ended.
@@ -28,11 +30,7 @@ pub(crate) async fn run(
     command: &Retarget,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let file = command.file.clone();
-    // Large recordings take seconds to parse.
-    let clip = tokio::task::spawn_blocking(move || emp_motion::load(&file)).await??;
-    let rate = client.robot(&command.robot).await?.control_rate;
-    let clip = clip.resampled(rate);
+    let (clip, rate) = command::motion(client, &command.file, &command.robot).await?;
     let config = StreamConfig {
         delivery: if command.realtime {
             Delivery::Latest
@@ -45,9 +43,10 @@ pub(crate) async fn run(
     };
     let (sender, mut events) = client.stream(config).await?;
     let mut table = JointCsvWriter::create(&command.out, events.joint_names())?;
-    let bar = progress_bar(clip.frames.len());
-    let mut statistics = Statistics::new();
     let frames = clip.frames.len() as u64;
+    let template = "{bar:40} {pos}/{len} frames  {per_sec}  {eta} left";
+    let bar = progress_bar(Some(frames), template);
+    let mut statistics = Statistics::new();
     let pace = command
         .realtime
         .then(|| Duration::from_secs_f64(1.0 / rate));
@@ -118,25 +117,11 @@ async fn receive(
                 reason,
                 attempt,
                 retry_in,
-            } => bar.suspend(|| {
-                eprintln!(
-                    "emp: connection lost ({reason}); attempt {attempt} in {} ms",
-                    retry_in.as_millis()
-                );
-            }),
+            } => bar.suspend(|| command::say_lost(&reason, attempt, retry_in)),
             Event::Reconnected { resent } => bar.suspend(|| {
                 eprintln!("emp: reconnected; {resent} frames sent again");
             }),
         }
-    }
-}
-
-/// A bar on standard error, if that is a terminal.
-fn progress_bar(frames: usize) -> ProgressBar {
-    let bar = ProgressBar::with_draw_target(Some(frames as u64), ProgressDrawTarget::stderr());
-    match ProgressStyle::with_template("{bar:40} {pos}/{len} frames  {per_sec}  {eta} left") {
-        Ok(style) => bar.with_style(style),
-        Err(_) => bar,
     }
 }
 

@@ -23,6 +23,8 @@ const HAND_OVER: usize = 4;
 /// Bytes of a snapshot in one message.
 const SNAPSHOT_PART: usize = 4 << 20;
 
+const OTHER_REQUEST: ClientError = ClientError::Contract("an answer to another request");
+
 fn service(channel: Channel) -> RolloutServiceClient<Channel> {
     RolloutServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE)
 }
@@ -53,8 +55,7 @@ impl Evaluation {
         });
         let response = service(channel)
             .evaluate(ReceiverStream::new(outbound))
-            .await
-            .map_err(ClientError::Status)?;
+            .await?;
         Ok(Self {
             responses: response.into_inner(),
         })
@@ -65,12 +66,9 @@ impl Evaluation {
     /// # Errors
     /// When the evaluation ended before its result.
     pub async fn next(&mut self) -> Result<Option<evaluate_response::Message>, ClientError> {
-        match self.responses.message().await {
-            Ok(Some(response)) => response.message.map(Some).ok_or(ClientError::Contract(
-                "a message without content; is the server newer?",
-            )),
-            Ok(None) => Ok(None),
-            Err(status) => Err(ClientError::Status(status)),
+        match self.responses.message().await? {
+            Some(response) => response.message.map(Some).ok_or(ClientError::EMPTY_MESSAGE),
+            None => Ok(None),
         }
     }
 }
@@ -126,8 +124,7 @@ impl Collection {
         tokio::spawn(sending);
         let responses = service(channel)
             .collect_rollouts(ReceiverStream::new(outbound))
-            .await
-            .map_err(ClientError::Status)?
+            .await?
             .into_inner();
         let mut collection = Self {
             requests,
@@ -165,7 +162,7 @@ impl Collection {
                 Message::Finished(finished) if finished.iteration == iteration => {
                     return Ok((blocks, finished));
                 }
-                _ => return Err(ClientError::Contract("an answer to another request")),
+                _ => return Err(OTHER_REQUEST),
             }
         }
     }
@@ -188,7 +185,7 @@ impl Collection {
                         return Ok(snapshot);
                     }
                 }
-                _ => return Err(ClientError::Contract("an answer to another request")),
+                _ => return Err(OTHER_REQUEST),
             }
         }
     }
@@ -210,7 +207,7 @@ impl Collection {
         }
         match self.receive().await? {
             collect_rollouts_response::Message::Restored(_) => Ok(()),
-            _ => Err(ClientError::Contract("an answer to another request")),
+            _ => Err(OTHER_REQUEST),
         }
     }
 
@@ -230,11 +227,8 @@ impl Collection {
     }
 
     async fn receive(&mut self) -> Result<collect_rollouts_response::Message, ClientError> {
-        let response = self.responses.message().await;
-        match response.map_err(ClientError::Status)? {
-            Some(response) => response.message.ok_or(ClientError::Contract(
-                "a message without content; is the server newer?",
-            )),
+        match self.responses.message().await? {
+            Some(response) => response.message.ok_or(ClientError::EMPTY_MESSAGE),
             None => Err(ClientError::Silence("the server ended the rollouts early")),
         }
     }

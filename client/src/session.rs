@@ -11,9 +11,10 @@ use emp_motion::Clip;
 use serde_json::{Value, json};
 use tokio::time::{Instant, MissedTickBehavior};
 
-use crate::cli::{Observe, Operate};
-
-const INTERRUPTED: u8 = 130;
+use crate::{
+    cli::{Observe, Operate},
+    command::{self, INTERRUPTED},
+};
 
 /// Sends a motion file as a session's operator, in real time.
 pub(crate) async fn operate(
@@ -21,17 +22,14 @@ pub(crate) async fn operate(
     command: &Operate,
     as_json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let file = command.file.clone();
-    // Large recordings take seconds to parse.
-    let clip = tokio::task::spawn_blocking(move || emp_motion::load(&file)).await??;
-    let rate = client.robot(&command.robot).await?.control_rate;
+    let (clip, rate) = command::motion(client, &command.file, &command.robot).await?;
     let config = TeleoperationConfig {
         emp_mode: command.emp_mode.map_or(EmpMode::Unspecified, EmpMode::from),
         ..TeleoperationConfig::new(&command.robot, &command.session)
     };
     let (sender, mut events) = client.operate(config).await?;
     say_who_is_there(&events.started().presence.unwrap_or_default());
-    tokio::spawn(send(clip.resampled(rate), sender, rate));
+    tokio::spawn(send(clip, sender, rate));
     let mut summary = Summary::default();
     let end = listen(&mut events, |result| summary.add(result)).await;
     if as_json {
@@ -119,10 +117,7 @@ fn say(event: &SessionEvent) {
             reason,
             attempt,
             retry_in,
-        } => eprintln!(
-            "emp: connection lost ({reason}); attempt {attempt} in {} ms",
-            retry_in.as_millis()
-        ),
+        } => command::say_lost(reason, *attempt, *retry_in),
         SessionEvent::Reconnected => eprintln!("emp: reconnected"),
     }
 }

@@ -15,7 +15,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming, transport::Channel};
 
 use crate::{
-    ClientError, Dropped, StreamClosed,
+    AnswerTimes, ClientError, Dropped, StreamClosed,
     kind::{Incoming, Kind, Started},
     wire,
 };
@@ -241,9 +241,10 @@ impl Kind for RobotEnd {
                 model_version: started.policy_version,
                 joint_names: [started.goal_joint_names, started.leg_joint_names].concat(),
             })),
-            Response::Result(message) => Some(Incoming::Result {
-                number: message.header.unwrap_or_default().sequence_number,
-                message,
+            Response::Result(result) => Some(Incoming::Result {
+                number: result.header.unwrap_or_default().sequence_number,
+                timing: result.timing,
+                result: Some(result),
             }),
             Response::Dropped(message) => Some(Incoming::Dropped(message)),
             // Only listeners are told who comes and goes.
@@ -251,15 +252,11 @@ impl Kind for RobotEnd {
         }
     }
 
-    fn answer(
-        number: u64,
-        message: TeleoperatedFrame,
-        latency: Duration,
-    ) -> Result<TeleoperationAnswer, ClientError> {
-        Ok(TeleoperationAnswer {
+    fn answer(number: u64, result: TeleoperatedFrame, times: AnswerTimes) -> TeleoperationAnswer {
+        TeleoperationAnswer {
             sequence_number: number,
-            result: message,
-            latency,
-        })
+            result,
+            latency: times.latency,
+        }
     }
 }

@@ -93,23 +93,21 @@ pub(crate) fn state(joint_positions: &[f32], orientation: &UnitQuaternion<f64>) 
 pub(crate) fn answer(
     sequence_number: u64,
     result: v1::RetargetResult,
-    timing: Option<v1::Timing>,
-    latency: Duration,
+    times: AnswerTimes,
 ) -> Answer {
     Answer {
         sequence_number,
         joint_angles: result.joint_angles,
         direction_error: result.direction_error,
         joints_at_limit: result.joints_at_limit,
-        times: times(timing, latency),
+        times,
     }
 }
 
 pub(crate) fn policy_answer(
     sequence_number: u64,
     result: v1::PolicyResult,
-    timing: Option<v1::Timing>,
-    latency: Duration,
+    times: AnswerTimes,
 ) -> PolicyAnswer {
     PolicyAnswer {
         sequence_number,
@@ -117,24 +115,23 @@ pub(crate) fn policy_answer(
         action: result.action,
         leg_targets: result.leg_targets,
         filter: result.filter,
-        times: times(timing, latency),
+        times,
     }
 }
 
 pub(crate) fn filter_answer(
     sequence_number: u64,
     result: v1::FilterResult,
-    timing: Option<v1::Timing>,
-    latency: Duration,
+    times: AnswerTimes,
 ) -> FilterAnswer {
     FilterAnswer {
         sequence_number,
         result,
-        times: times(timing, latency),
+        times,
     }
 }
 
-fn times(timing: Option<v1::Timing>, latency: Duration) -> AnswerTimes {
+pub(crate) fn times(timing: Option<v1::Timing>, latency: Duration) -> AnswerTimes {
     let timing = timing.unwrap_or_default();
     AnswerTimes {
         queue_time: duration(timing.queue_time),

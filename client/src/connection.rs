@@ -91,15 +91,6 @@ pub(crate) struct Attempts {
     last: Break,
 }
 
-/// The attempt that comes next.
-pub(crate) struct Attempt {
-    /// Why the one before failed, or the connection was lost.
-    pub(crate) reason: String,
-    /// Counted from 1.
-    pub(crate) number: u32,
-    pub(crate) retry_in: Duration,
-}
-
 impl Attempts {
     pub(crate) fn after(last: Break, backoff: Backoff) -> Self {
         Self {
@@ -110,8 +101,8 @@ impl Attempts {
         }
     }
 
-    /// The next attempt, unless it is time to give up.
-    pub(crate) fn another(&mut self) -> Result<Attempt, End> {
+    /// Why another attempt is due, its number from 1, and when it comes; unless it is time to give up.
+    pub(crate) fn another(&mut self) -> Result<(String, u32, Duration), End> {
         self.number += 1;
         let retry_in = self.backoff.pause(self.number, &self.last);
         let reason = self.last.reason().to_owned();
@@ -122,11 +113,7 @@ impl Attempts {
                 last: reason,
             }));
         }
-        Ok(Attempt {
-            reason,
-            number: self.number,
-            retry_in,
-        })
+        Ok((reason, self.number, retry_in))
     }
 
     /// Remembers why an attempt failed, if another may succeed.

@@ -9,7 +9,7 @@ use tonic::{Status, transport::Channel};
 use crate::{
     Backoff, ClientError, DropCause, Dropped, Event, FrameSender, StreamEvents,
     backoff::Break,
-    connection::{self, Attempt, Attempts, EVENTS, End, HAND_OVER},
+    connection::{self, Attempts, EVENTS, End, HAND_OVER},
     kind::{Incoming, Kind, Started},
     stream::Outbound,
     wire,
@@ -204,14 +204,10 @@ impl<K: Kind> Driver<K> {
         self.unsent = 0;
         let mut attempts = Attempts::after(last, self.backoff);
         loop {
-            let Attempt {
-                reason,
-                number,
-                retry_in,
-            } = attempts.another()?;
+            let (reason, attempt, retry_in) = attempts.another()?;
             self.tell(Event::ConnectionLost {
                 reason,
-                attempt: number,
+                attempt,
                 retry_in,
             })
             .await?;

@@ -13,7 +13,7 @@ use tonic::{Status, transport::Channel};
 use crate::{
     Backoff, ClientError, PoseSender, SessionEvent, SessionEvents, TeleoperationConfig,
     backoff::Break,
-    connection::{self, Attempt, Attempts, EVENTS, End, HAND_OVER},
+    connection::{self, Attempts, EVENTS, End, HAND_OVER},
     teleoperation, wire,
 };
 
@@ -139,14 +139,10 @@ impl Listener {
     async fn reconnect(&mut self, last: Break) -> Result<Connection, End> {
         let mut attempts = Attempts::after(last, self.backoff);
         loop {
-            let Attempt {
-                reason,
-                number,
-                retry_in,
-            } = attempts.another()?;
+            let (reason, attempt, retry_in) = attempts.another()?;
             self.tell(SessionEvent::ConnectionLost {
                 reason,
-                attempt: number,
+                attempt,
                 retry_in,
             })
             .await?;

@@ -17,18 +17,18 @@ use std::{
 };
 
 use anyhow::Context as _;
-use emp_client::{
-    Client, EmpMode, Event, FilterConfig, GoalFrame, GoalHistory, PolicyConfig, RobotFrame,
-    StreamConfig,
-};
+use emp_client::{Client, EmpMode, FilterConfig, GoalFrame, GoalHistory};
 use emp_models::{
     emp::{Emp, EmpConfig},
     observation::{History, RobotState},
 };
 use emp_robot::Robot;
-use emp_tests::{TestServer, emp, emp27, poses, raw};
+use emp_tests::{
+    TestServer, emp, emp27,
+    load::{self, RATE, at},
+    raw,
+};
 use nalgebra::UnitQuaternion;
-use tokio::time::MissedTickBehavior;
 use tonic::{client::Grpc, transport::Endpoint};
 
 const ROBOT: &str = "emp27";
@@ -37,10 +37,6 @@ const CLIENTS: usize = 8;
 const ROUNDS: usize = 5;
 /// How long a server is asked in a round, and how long before without counting.
 const ROUND: [Duration; 2] = [Duration::from_secs(3), Duration::from_millis(500)];
-/// How long a robot is teleoperated.
-const TELEOPERATED: Duration = Duration::from_secs(20);
-/// Control rate of the robot, Hz.
-const RATE: f64 = 50.0;
 /// Largest difference between the two servers' answers, rad.
 const TOLERANCE: f32 = 1e-3;
 
@@ -144,14 +140,6 @@ impl Served {
             latencies,
         }
     }
-}
-
-/// Milliseconds of a share of times in order.
-fn at(times: &[Duration], share: f64) -> f64 {
-    let place = times.len().saturating_sub(1) as f64 * share;
-    times
-        .get(place as usize)
-        .map_or(f64::NAN, |time| 1e3 * time.as_secs_f64())
 }
 
 /// Asks our server from [`CLIENTS`] connections, each as soon as it has its answer.
@@ -329,44 +317,10 @@ impl RawClient {
     }
 }
 
-/// Round trips of a robot's control periods: a pose becomes a goal, goal and state become an executable goal and leg targets.
+/// The round trips of a robot's whole path.
 async fn teleoperate(server: &TestServer, mode: EmpMode) -> anyhow::Result<()> {
     let client = Client::connect(&server.url()).await?;
-    let robot = emp27()?;
-    let retarget = StreamConfig {
-        refine: true,
-        smoothing: true,
-        ..StreamConfig::for_robot(ROBOT)
-    };
-    let policy = PolicyConfig {
-        emp_mode: mode,
-        ..PolicyConfig::for_robot(ROBOT)
-    };
-    let (mut poses_out, mut goals) = client.stream(retarget).await?;
-    let (mut states_out, mut targets) = client.policy_stream(policy).await?;
-    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
-    let frames = (TELEOPERATED.as_secs_f64() * RATE) as usize;
-    let mut times = Vec::with_capacity(frames);
-    for pose in &poses(1, frames) {
-        let tick = ticks.tick().await;
-        poses_out.send(pose, None).await?;
-        let Some(Event::Answer(goal)) = goals.next().await? else {
-            anyhow::bail!("a pose without an answer")
-        };
-        let state = RobotFrame {
-            joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
-            orientation: UnitQuaternion::identity(),
-            goal: goal.joint_angles,
-            reset: false,
-        };
-        states_out.send(&state, None).await?;
-        let Some(Event::Answer(_)) = targets.next().await? else {
-            anyhow::bail!("a state without an answer")
-        };
-        times.push(tick.elapsed());
-    }
-    times.sort_unstable();
+    let times = load::teleoperate(&client, mode).await?;
     println!(
         "a robot at {RATE} Hz (retarget, refined; EMP {mode:?}; policy): p50 {:.2} ms, p99 {:.2} ms, longest {:.2} ms",
         at(&times, 0.5),

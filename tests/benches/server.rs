@@ -12,22 +12,21 @@ use std::{
 use anyhow::Context as _;
 use criterion::Criterion;
 use emp_client::{
-    Client, Delivery, EvaluateConfig, EvaluationEvent, Event, PolicyConfig, ProceduralClips,
-    RobotFrame, Statistics, StreamConfig, Summary,
+    Client, Delivery, EmpMode, EvaluateConfig, EvaluationEvent, Event, ProceduralClips, Statistics,
+    StreamConfig, Summary,
 };
-use emp_tests::{TestServer, emp27, policy, poses};
-use nalgebra::UnitQuaternion;
+use emp_tests::{
+    TestServer,
+    load::{RATE, TELEOPERATED, at, teleoperate},
+    policy, poses,
+};
 use tokio::{runtime::Runtime, time::MissedTickBehavior};
 
 const ROBOT: &str = "emp27";
-/// The rate that a stream must keep, Hz.
-const RATE: f64 = 50.0;
 /// How long each number of streams is held.
 const HELD: Duration = Duration::from_secs(5);
 /// A number of streams is held when this share of answers comes before the next frame, and no more are dropped.
 const ON_TIME: f64 = 0.99;
-/// How long a robot is teleoperated, alone and beside an evaluation.
-const TELEOPERATED: Duration = Duration::from_secs(20);
 
 fn main() -> anyhow::Result<()> {
     let weights = policy::weights()?;
@@ -174,7 +173,7 @@ async fn hold(client: &Client, streams: usize, refine: bool) -> anyhow::Result<S
 
 /// Teleoperates a robot alone, then while an evaluation takes all the time that the system has left.
 async fn beside_an_evaluation(client: &Client) -> anyhow::Result<()> {
-    report("alone", &teleoperate(client).await?);
+    report("alone", &teleoperate(client, EmpMode::Off).await?);
     let config = EvaluateConfig {
         robot: ROBOT.to_owned(),
         episodes: 100_000,
@@ -197,7 +196,7 @@ async fn beside_an_evaluation(client: &Client) -> anyhow::Result<()> {
             }
         }
     });
-    let beside = teleoperate(client).await?;
+    let beside = teleoperate(client, EmpMode::Off).await?;
     simulated.abort();
     report("beside an evaluation", &beside);
     println!(
@@ -207,48 +206,11 @@ async fn beside_an_evaluation(client: &Client) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Round trips of a robot's control periods, in order of length: a pose becomes a goal, goal and state become leg targets.
-async fn teleoperate(client: &Client) -> anyhow::Result<Vec<Duration>> {
-    let robot = emp27()?;
-    let retarget = StreamConfig {
-        refine: true,
-        smoothing: true,
-        ..StreamConfig::for_robot(ROBOT)
-    };
-    let (mut poses_out, mut goals) = client.stream(retarget).await?;
-    let config = PolicyConfig::for_robot(ROBOT);
-    let (mut states_out, mut targets) = client.policy_stream(config).await?;
-    let frames = (TELEOPERATED.as_secs_f64() * RATE) as usize;
-    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
-    let mut times = Vec::with_capacity(frames);
-    for pose in &poses(1, frames) {
-        let tick = ticks.tick().await;
-        poses_out.send(pose, None).await?;
-        let Some(Event::Answer(goal)) = goals.next().await? else {
-            anyhow::bail!("a pose without an answer")
-        };
-        let state = RobotFrame {
-            joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
-            orientation: UnitQuaternion::identity(),
-            goal: goal.joint_angles,
-            reset: false,
-        };
-        states_out.send(&state, None).await?;
-        let Some(Event::Answer(_)) = targets.next().await? else {
-            anyhow::bail!("a state without an answer")
-        };
-        times.push(tick.elapsed());
-    }
-    times.sort_unstable();
-    Ok(times)
-}
-
 fn report(what: &str, times: &[Duration]) {
-    let at = |share: f64| 1e3 * times[((times.len() - 1) as f64 * share) as usize].as_secs_f64();
     println!(
         "a robot at {RATE} Hz (retarget, refined, and policy) {what}: p50 {:.2} ms, p99 {:.2} ms, longest {:.2} ms",
-        at(0.5),
-        at(0.99),
-        at(1.0),
+        at(times, 0.5),
+        at(times, 0.99),
+        at(times, 1.0),
     );
 }

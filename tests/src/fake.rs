@@ -12,6 +12,8 @@ use emp_robot::Robot;
 use emp_server::{Backend, BackendError, Catalog, RetargetBackend, Settings};
 use nalgebra::Vector3;
 
+use crate::{TestServer, emp27};
+
 /// Height of the torso over the waist that makes the fake model panic, metres. No test uses it otherwise.
 const PANIC_HEIGHT: f32 = 1.25;
 
@@ -172,6 +174,15 @@ pub fn panic_pose() -> KeyNodeFrame {
     let mut pose = pose(0.0);
     pose.positions[KeyNode::Torso as usize].z = PANIC_HEIGHT;
     pose
+}
+
+/// A server of the fake model behind `gate`.
+///
+/// # Errors
+/// When it cannot be started.
+pub fn server(settings: Settings, gate: &Gate) -> anyhow::Result<TestServer> {
+    let catalog = catalog(&settings, &emp27()?, gate)?;
+    TestServer::start(settings, catalog)
 }
 
 /// A catalog with the fake model behind `gate`, for `robot`.

@@ -7,6 +7,7 @@
 
 pub mod emp;
 pub mod fake;
+pub mod load;
 pub mod policy;
 pub mod process;
 pub mod raw;
@@ -21,10 +22,12 @@ use std::{
 
 use anyhow::Context as _;
 use emp_motion::{KeyNodeFrame, skills};
+use emp_proto::v1::motion_service_client::MotionServiceClient;
 use emp_robot::Robot;
 use emp_server::{Catalog, Drain, Overrides, ServeError, Server, Settings};
 use tokio::{runtime::Runtime, task::JoinHandle};
 use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
 
 /// No step of a test takes this long on a slow machine; one that does hangs.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -93,13 +96,25 @@ impl TestServer {
     /// # Errors
     /// When nothing can be served.
     pub fn start_with(weights: &Path, change: impl FnOnce(&mut Settings)) -> anyhow::Result<Self> {
+        Self::start_with_on(0, weights, change)
+    }
+
+    /// [`start_with`](Self::start_with) on a port.
+    ///
+    /// # Errors
+    /// When it cannot listen, or nothing can be served.
+    pub fn start_with_on(
+        port: u16,
+        weights: &Path,
+        change: impl FnOnce(&mut Settings),
+    ) -> anyhow::Result<Self> {
         let mut settings = Settings {
             weights: Some(weights.to_owned()),
             ..settings()?
         };
         change(&mut settings);
         let catalog = Catalog::load(&settings)?;
-        Self::start(settings, catalog)
+        Self::start_on(port, settings, catalog)
     }
 
     /// The server's URL.
@@ -110,6 +125,14 @@ impl TestServer {
     /// The server's port.
     pub fn port(&self) -> u16 {
         self.address.port()
+    }
+
+    /// A client without the client library's care.
+    ///
+    /// # Errors
+    /// When it cannot connect.
+    pub async fn raw_client(&self) -> anyhow::Result<MotionServiceClient<Channel>> {
+        Ok(MotionServiceClient::connect(self.url()).await?)
     }
 
     /// Tells the server to drain, as SIGTERM does.
@@ -186,6 +209,17 @@ pub fn poses(seed: u64, count: usize) -> Vec<KeyNodeFrame> {
         .cycle()
         .take(count)
         .collect()
+}
+
+/// Compares numbers one by one.
+///
+/// # Panics
+/// When two differ by more than `tolerance`.
+pub fn assert_near(a: &[f32], b: &[f32], tolerance: f32) {
+    assert_eq!(a.len(), b.len());
+    for (a, b) in a.iter().zip(b) {
+        assert!((a - b).abs() <= tolerance, "{a} {b}");
+    }
 }
 
 /// Waits for a step of a test, but not forever.

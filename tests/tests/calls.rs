@@ -4,16 +4,16 @@ use std::time::Duration;
 
 use emp_client::{Client, ClientError};
 use emp_models::retarget::{RetargetInput, Retargeter};
-use emp_proto::v1::{
-    FrameHeader, HumanPose, Position, RetargetRequest, motion_service_client::MotionServiceClient,
-};
+use emp_proto::v1::{FrameHeader, HumanPose, Position, RetargetRequest};
 use emp_server::Settings;
 use emp_tests::{
     TestServer, emp27,
     fake::{self, Gate},
-    poses, raw, weights, within,
+    poses,
+    raw::{self, wrong_field},
+    weights, within,
 };
-use tonic::{Code, Request, Status, metadata::MetadataValue, transport::Channel};
+use tonic::{Code, Request, metadata::MetadataValue};
 use tonic_types::StatusExt as _;
 
 /// Largest difference between a pose that was computed alone and in a batch, radians: a batch adds in another order.
@@ -23,12 +23,6 @@ const BATCH_TOLERANCE: f32 = 1e-3;
 const CODE_TIES: usize = 3;
 /// Either code points the arms the same way, radians.
 const DIRECTION_TOLERANCE: f32 = 0.02;
-
-async fn raw_client(server: &TestServer) -> MotionServiceClient<Channel> {
-    MotionServiceClient::connect(server.url())
-        .await
-        .expect("connected")
-}
 
 fn request(pose: Option<HumanPose>) -> RetargetRequest {
     RetargetRequest {
@@ -40,20 +34,6 @@ fn request(pose: Option<HumanPose>) -> RetargetRequest {
 
 fn good_pose() -> HumanPose {
     raw::pose(&fake::pose(0.1))
-}
-
-fn fake_server(settings: Settings, gate: &Gate) -> anyhow::Result<TestServer> {
-    let catalog = fake::catalog(&settings, &emp27()?, gate)?;
-    TestServer::start(settings, catalog)
-}
-
-fn wrong_field(status: &Status) -> String {
-    assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-    let details = status.get_error_details();
-    assert_eq!(details.error_info().expect("ErrorInfo").domain, "emp.v1");
-    details.bad_request().expect("BadRequest").field_violations[0]
-        .field
-        .clone()
 }
 
 #[tokio::test]
@@ -146,8 +126,8 @@ async fn the_model_service_says_what_is_served() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn wrong_fields_are_refused_by_name() -> anyhow::Result<()> {
-    let server = fake_server(Settings::default(), &Gate::open())?;
-    let mut client = raw_client(&server).await;
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let mut client = server.raw_client().await?;
     let far = Some(Position {
         x: 1e6,
         y: 0.0,
@@ -234,8 +214,8 @@ async fn wrong_fields_are_refused_by_name() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn an_oversize_message_is_refused() -> anyhow::Result<()> {
-    let server = fake_server(Settings::default(), &Gate::open())?;
-    let mut client = raw_client(&server).await;
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let mut client = server.raw_client().await?;
     let huge = RetargetRequest {
         robot: "x".repeat(300 << 10),
         ..request(Some(good_pose()))
@@ -249,8 +229,8 @@ async fn an_oversize_message_is_refused() -> anyhow::Result<()> {
 #[tokio::test]
 async fn deadlines_end_calls_with_deadline_exceeded() -> anyhow::Result<()> {
     let gate = Gate::closed();
-    let server = fake_server(Settings::default(), &gate)?;
-    let mut client = raw_client(&server).await;
+    let server = fake::server(Settings::default(), &gate)?;
+    let mut client = server.raw_client().await?;
 
     let mut call = Request::new(request(Some(good_pose())));
     call.metadata_mut()
@@ -302,8 +282,8 @@ async fn a_full_queue_refuses_calls_and_says_when_to_come_back() -> anyhow::Resu
     let gate = Gate::closed();
     let mut settings = Settings::default();
     settings.batching.queue = 1.try_into()?;
-    let server = fake_server(settings, &gate)?;
-    let client = raw_client(&server).await;
+    let server = fake::server(settings, &gate)?;
+    let client = server.raw_client().await?;
     let call = || {
         let mut client = client.clone();
         tokio::spawn(async move { client.retarget(request(Some(good_pose()))).await })

@@ -24,9 +24,7 @@ const BACKOFF: Backoff = Backoff {
 };
 
 fn fake_server(gate: &Gate) -> anyhow::Result<TestServer> {
-    let settings = Settings::default();
-    let catalog = fake::catalog(&settings, &emp27()?, gate)?;
-    TestServer::start(settings, catalog)
+    fake::server(Settings::default(), gate)
 }
 
 async fn next(events: &mut StreamEvents) -> anyhow::Result<Option<Event>> {
@@ -154,8 +152,7 @@ async fn draining_cuts_off_what_does_not_end_in_time() -> anyhow::Result<()> {
     let gate = Gate::closed();
     let mut settings = Settings::default();
     settings.shutdown.grace_seconds = 0.3;
-    let catalog = fake::catalog(&settings, &emp27()?, &gate)?;
-    let server = TestServer::start(settings, catalog)?;
+    let server = fake::server(settings, &gate)?;
     let client = Client::connect(&server.url()).await?;
     let call = tokio::spawn(async move { client.retarget("emp27", &fake::pose(0.0), false).await });
     within("the model to be busy", gate.has_entered(1)).await?;

@@ -17,20 +17,21 @@ use emp_models::{
     observation::RobotState,
 };
 use emp_proto::v1::{
-    self, FilterFrame, FilterGoalRequest, FrameHeader, PolicyObservation, StepPolicyRequest,
+    self, FilterFrame, FilterGoalRequest, PolicyObservation, StepPolicyRequest,
     StreamFilterGoalConfig, StreamFilterGoalRequest, StreamFilterGoalResponse,
     motion_service_client::MotionServiceClient, stream_filter_goal_request::Message as Request,
     stream_filter_goal_response::Message as Response,
 };
 use emp_robot::Robot;
-use emp_tests::{TestServer, emp, emp27, policy, raw, within};
+use emp_tests::{
+    TestServer, emp, emp27, policy,
+    raw::{self, OneOf as _, RawStream, wrong_field},
+    within,
+};
 use nalgebra::UnitQuaternion;
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 use tempfile::TempDir;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming, transport::Channel};
-use tonic_types::StatusExt as _;
+use tonic::{Code, transport::Channel};
 
 /// Largest difference between an answer of the server and one of this process. The orientation travels as f32, and a batch
 /// adds in another order.
@@ -70,7 +71,7 @@ impl Fixture {
     }
 
     async fn raw_client(&self) -> anyhow::Result<MotionServiceClient<Channel>> {
-        Ok(MotionServiceClient::connect(self.server.url()).await?)
+        self.server.raw_client().await
     }
 
     fn controller(&self, name: &str) -> anyhow::Result<Controller> {
@@ -116,16 +117,20 @@ impl Reference {
             action => action.to_vec(),
         };
         self.state.history_mut().set_last_action(&action);
-        let input = ControllerInput {
-            state: RobotState {
-                joint_positions: &frame.joint_positions,
-                orientation: frame.orientation,
-            },
-            goal: &frame.goal,
-        };
+        let input = controller_input(frame);
         let filter = self.filter.as_ref().map(|filter| filter as &dyn GoalFilter);
         let layout = &self.emp.config().observation;
         Ok(filter_goals(layout, filter, &mut [(&mut self.state, input)])?.remove(0))
+    }
+}
+
+fn controller_input(frame: &GoalFrame) -> ControllerInput<'_> {
+    ControllerInput {
+        state: RobotState {
+            joint_positions: &frame.joint_positions,
+            orientation: frame.orientation,
+        },
+        goal: &frame.goal,
     }
 }
 
@@ -154,13 +159,7 @@ fn episode(robot: &Robot) -> Vec<GoalFrame> {
 }
 
 fn assert_near(served: &[f32], expected: &[f32]) {
-    assert_eq!(served.len(), expected.len());
-    for (served, expected) in served.iter().zip(expected) {
-        assert!(
-            (served - expected).abs() <= TOLERANCE,
-            "{served} {expected}"
-        );
-    }
+    emp_tests::assert_near(served, expected, TOLERANCE);
 }
 
 fn assert_equal(served: &FilterResult, expected: &FilteredGoal) {
@@ -306,10 +305,7 @@ async fn answers_say_how_the_robot_stands_and_why_a_goal_was_changed() -> anyhow
         let served = answers(&client, with_mode(mode), &frames[..2]).await?;
         for (answer, frame) in served.iter().zip(&frames) {
             let result = &answer.result;
-            let state = RobotState {
-                joint_positions: &frame.joint_positions,
-                orientation: frame.orientation,
-            };
+            let state = controller_input(frame).state;
             let goal = GoalPath {
                 asked: &frame.goal,
                 filtered: &result.executable_goal,
@@ -365,13 +361,7 @@ async fn check_policy(
         let Some(Event::Answer(served)) = within("an answer", events.next()).await?? else {
             panic!("unanswered")
         };
-        let input = ControllerInput {
-            state: RobotState {
-                joint_positions: &frame.joint_positions,
-                orientation: frame.orientation,
-            },
-            goal: &frame.goal,
-        };
+        let input = controller_input(frame);
         let expected = controller.step(&mut [(&mut state, input)])?.remove(0);
         assert_near(&served.executable_goal, &expected.goal);
         assert_near(&served.action, &expected.action);
@@ -420,21 +410,9 @@ fn observation(frame: &FilterFrame) -> PolicyObservation {
 }
 
 fn wire_frame(number: u64, frame: &GoalFrame) -> FilterFrame {
-    let q = frame.orientation.cast::<f32>();
     FilterFrame {
-        header: Some(FrameHeader {
-            sequence_number: number,
-            ..FrameHeader::default()
-        }),
-        state: Some(v1::RobotState {
-            joint_positions: frame.joint_positions.clone(),
-            base_orientation: Some(v1::Quaternion {
-                w: q.w,
-                x: q.i,
-                y: q.j,
-                z: q.k,
-            }),
-        }),
+        header: Some(raw::header(number)),
+        state: Some(raw::state(&frame.joint_positions, &frame.orientation)),
         goal: frame.goal.clone(),
         last_action: frame.last_action.clone(),
         reset: frame.reset,
@@ -457,13 +435,7 @@ async fn a_single_policy_step_goes_through_the_emp_when_asked() -> anyhow::Resul
         let result = response.result.expect("a result");
         assert_eq!(result.filter.is_some(), mode != EmpMode::Off);
         let controller = fixture.controller(name)?;
-        let input = ControllerInput {
-            state: RobotState {
-                joint_positions: &frame.joint_positions,
-                orientation: frame.orientation,
-            },
-            goal: &frame.goal,
-        };
+        let input = controller_input(frame);
         let expected = controller.step(&mut [(&mut controller.state(), input)])?;
         assert_near(&result.executable_goal, &expected[0].goal);
         assert_near(&result.action, &expected[0].action);
@@ -471,19 +443,11 @@ async fn a_single_policy_step_goes_through_the_emp_when_asked() -> anyhow::Resul
     Ok(())
 }
 
-fn wrong_field(status: &Status) -> String {
-    assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-    let details = status.get_error_details();
-    details.bad_request().expect("BadRequest").field_violations[0]
-        .field
-        .clone()
-}
-
 #[tokio::test]
 async fn a_robot_without_an_emp_serves_the_rest_with_the_mode_off() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let server = TestServer::start_with(weights.path(), |_| {})?;
-    let mut client = MotionServiceClient::connect(server.url()).await?;
+    let mut client = server.raw_client().await?;
     let frame = wire_frame(0, &episode(&*emp27()?)[0]);
     let step = |mode: EmpMode| StepPolicyRequest {
         robot: "emp27".to_owned(),
@@ -631,62 +595,36 @@ fn bad_frames(good: &GoalFrame) -> Vec<(&'static str, FilterFrame)> {
     ]
 }
 
-/// A stream without the client library's care.
-struct RawStream {
-    requests: Option<mpsc::Sender<StreamFilterGoalRequest>>,
-    responses: Streaming<StreamFilterGoalResponse>,
+type FilterStream = RawStream<StreamFilterGoalRequest, StreamFilterGoalResponse>;
+
+async fn open(client: &MotionServiceClient<Channel>) -> anyhow::Result<FilterStream> {
+    RawStream::open(async |requests| client.clone().stream_filter_goal(requests).await).await
 }
 
-impl RawStream {
-    async fn open(client: &MotionServiceClient<Channel>) -> anyhow::Result<Self> {
-        let (requests, outbound) = mpsc::channel(64);
-        let responses = client
-            .clone()
-            .stream_filter_goal(ReceiverStream::new(outbound))
-            .await?
-            .into_inner();
-        Ok(Self {
-            requests: Some(requests),
-            responses,
-        })
-    }
+async fn started(
+    client: &MotionServiceClient<Channel>,
+    delivery: Delivery,
+) -> anyhow::Result<FilterStream> {
+    let mut stream = open(client).await?;
+    let config = StreamFilterGoalConfig {
+        delivery: delivery.into(),
+        ..config("emp27")
+    };
+    stream.send(Request::Config(config)).await;
+    let Ok(Some(Response::Started(started))) = stream.next().await? else {
+        panic!("not started")
+    };
+    assert_eq!(started.history, 15);
+    assert_eq!(started.goal_joint_names.len(), 15);
+    assert_eq!(started.leg_joint_names.len(), 12);
+    Ok(stream)
+}
 
-    async fn started(
-        client: &MotionServiceClient<Channel>,
-        delivery: Delivery,
-    ) -> anyhow::Result<Self> {
-        let mut stream = Self::open(client).await?;
-        let config = StreamFilterGoalConfig {
-            delivery: delivery.into(),
-            ..config("emp27")
-        };
-        stream.send(Request::Config(config)).await?;
-        let Ok(Some(Response::Started(started))) = stream.next().await? else {
-            panic!("not started")
-        };
-        assert_eq!(started.history, 15);
-        assert_eq!(started.goal_joint_names.len(), 15);
-        assert_eq!(started.leg_joint_names.len(), 12);
-        Ok(stream)
-    }
-
-    async fn send(&self, message: Request) -> anyhow::Result<()> {
-        let requests = self.requests.as_ref().expect("not half-closed");
-        let message = Some(message);
-        Ok(requests.send(StreamFilterGoalRequest { message }).await?)
-    }
-
-    async fn next(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
-        let response = within("a message", self.responses.message()).await?;
-        Ok(response.map(|response| response.and_then(|response| response.message)))
-    }
-
-    /// The result of the frame that was sent last.
-    async fn result(&mut self) -> anyhow::Result<FilterResult> {
-        match self.next().await? {
-            Ok(Some(Response::Result(answered))) => Ok(answered.result.expect("a result")),
-            other => panic!("{other:?}"),
-        }
+/// The result of the frame that was sent last.
+async fn result(stream: &mut FilterStream) -> anyhow::Result<FilterResult> {
+    match stream.next().await? {
+        Ok(Some(Response::Result(answered))) => Ok(answered.result.expect("a result")),
+        other => panic!("{other:?}"),
     }
 }
 
@@ -703,10 +641,10 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
     let client = fixture.raw_client().await?;
     let frames = episode(&fixture.robot);
     for delivery in [Delivery::All, Delivery::Latest] {
-        let mut stream = RawStream::started(&client, delivery).await?;
+        let mut stream = started(&client, delivery).await?;
         let mut reference = Reference::new(&fixture.emp, EmpMode::On);
         for (frame, (field, bad)) in frames.iter().zip(bad_frames(&frames[0])) {
-            stream.send(Request::Frame(bad)).await?;
+            stream.send(Request::Frame(bad)).await;
             let Ok(Some(Response::Dropped(dropped))) = stream.next().await? else {
                 panic!("{field}: not dropped")
             };
@@ -714,8 +652,8 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
                 (dropped.reason(), dropped.field.as_str()),
                 (DropReason::Invalid, field)
             );
-            stream.send(Request::Frame(wire_frame(7, frame))).await?;
-            assert_equal(&stream.result().await?, &reference.step(frame)?);
+            stream.send(Request::Frame(wire_frame(7, frame))).await;
+            assert_equal(&result(&mut stream).await?, &reference.step(frame)?);
         }
         // The `reset` of a bad frame holds for the frame after it.
         let bad = FilterFrame {
@@ -723,16 +661,16 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
             reset: true,
             ..wire_frame(0, &frames[0])
         };
-        stream.send(Request::Frame(bad)).await?;
+        stream.send(Request::Frame(bad)).await;
         assert!(matches!(
             stream.next().await?,
             Ok(Some(Response::Dropped(_)))
         ));
         stream
             .send(Request::Frame(wire_frame(8, &frames[30])))
-            .await?;
+            .await;
         let anew = &fixture.filtered(EmpMode::On, &frames[30..31])?[0];
-        assert_equal(&stream.result().await?, anew);
+        assert_equal(&result(&mut stream).await?, anew);
     }
     Ok(())
 }
@@ -769,17 +707,15 @@ async fn bad_configs_end_the_stream_by_field() -> anyhow::Result<()> {
         ),
     ];
     for (field, messages) in cases {
-        let mut stream = RawStream::open(&client).await?;
+        let mut stream = open(&client).await?;
         for message in messages {
-            stream.send(message).await?;
+            stream.send(message).await;
         }
-        let status = loop {
-            match stream.next().await? {
-                Ok(Some(Response::Started(_))) => {}
-                Ok(other) => panic!("{field}: {other:?}"),
-                Err(status) => break status,
-            }
-        };
+        let (before, status) = stream.failure().await?;
+        assert!(
+            before.iter().all(|m| matches!(m, Response::Started(_))),
+            "{field}: {before:?}"
+        );
         assert_eq!(wrong_field(&status), field);
     }
     Ok(())
@@ -854,15 +790,13 @@ async fn half_close_answers_what_waits() -> anyhow::Result<()> {
     let fixture = fixture()?;
     let client = fixture.raw_client().await?;
     let frames = episode(&fixture.robot);
-    let mut stream = RawStream::started(&client, Delivery::All).await?;
+    let mut stream = started(&client, Delivery::All).await?;
     for (number, frame) in (0..).zip(&frames) {
-        stream
-            .send(Request::Frame(wire_frame(number, frame)))
-            .await?;
+        stream.send(Request::Frame(wire_frame(number, frame))).await;
     }
-    stream.requests = None;
+    stream.finish();
     for expected in fixture.filtered(EmpMode::On, &frames)? {
-        assert_equal(&stream.result().await?, &expected);
+        assert_equal(&result(&mut stream).await?, &expected);
     }
     assert!(matches!(stream.next().await?, Ok(None)));
     Ok(())
@@ -874,7 +808,7 @@ async fn half_close_answers_what_waits() -> anyhow::Result<()> {
 async fn the_reset_of_a_superseded_frame_holds() -> anyhow::Result<()> {
     let fixture = fixture()?;
     let client = fixture.raw_client().await?;
-    let mut stream = RawStream::started(&client, Delivery::Latest).await?;
+    let mut stream = started(&client, Delivery::Latest).await?;
     let mut reference = Reference::new(&fixture.emp, EmpMode::On);
     let mut frames = episode(&fixture.robot);
     for frame in frames.iter_mut().skip(10).step_by(7) {
@@ -885,9 +819,7 @@ async fn the_reset_of_a_superseded_frame_holds() -> anyhow::Result<()> {
         let mut superseded = 0;
         let mut results = Vec::new();
         for (number, frame) in (0..).zip(&frames) {
-            stream
-                .send(Request::Frame(wire_frame(number, frame)))
-                .await?;
+            stream.send(Request::Frame(wire_frame(number, frame))).await;
         }
         while superseded + results.len() < FRAMES {
             match stream.next().await? {
@@ -935,10 +867,8 @@ async fn hostile_bytes_harm_nobody() -> anyhow::Result<()> {
         ..FilterGoalRequest::default()
     };
     let messages = [Request::Config(config("emp27")), Request::Frame(frame)];
-    let [config, frame] = messages.map(|message| {
-        let message = Some(message);
-        StreamFilterGoalRequest { message }.encode_to_vec()
-    });
+    let [config, frame] =
+        messages.map(|message| StreamFilterGoalRequest::holding(Some(message)).encode_to_vec());
     let channel = tonic::transport::Endpoint::from_shared(fixture.server.url())?;
     let mut client = tonic::client::Grpc::new(channel.connect().await?);
     let mut rng = StdRng::seed_from_u64(5);

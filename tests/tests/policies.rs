@@ -4,22 +4,25 @@ use std::sync::Arc;
 
 use emp_client::{Client, Delivery, DropReason, Event, PolicyAnswer, PolicyConfig, RobotFrame};
 use emp_models::{
-    controller::{Controller, ControllerInput, ControllerOutput},
+    controller::{Controller, ControllerInput, ControllerOutput, ControllerState},
     observation::RobotState,
 };
 use emp_proto::v1::{
-    self, PolicyFrame, PolicyObservation, Quaternion, StepPolicyRequest, StreamPolicyConfig,
-    StreamPolicyRequest, motion_service_client::MotionServiceClient,
-    stream_policy_request::Message as Request, stream_policy_response::Message as Response,
+    self, PolicyFrame, PolicyObservation, PolicyResult, Quaternion, StepPolicyRequest,
+    StreamPolicyConfig, StreamPolicyRequest, StreamPolicyResponse,
+    motion_service_client::MotionServiceClient, stream_policy_request::Message as Request,
+    stream_policy_response::Message as Response,
 };
 use emp_robot::Robot;
 use emp_sim::{BodyParameters, Stage, Start, Targets};
-use emp_tests::{TestServer, emp27, policy, within};
+use emp_tests::{
+    TestServer, emp27, policy,
+    raw::{self, RawStream, wrong_field},
+    within,
+};
 use nalgebra::UnitQuaternion;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming, transport::Channel};
-use tonic_types::StatusExt as _;
+use tempfile::TempDir;
+use tonic::{Code, transport::Channel};
 
 /// Largest difference between an answer of the server and one of this process. The orientation travels as f32, and a batch
 /// adds in another order.
@@ -35,7 +38,7 @@ struct Episode {
 
 fn step(
     controller: &Controller,
-    state: &mut emp_models::controller::ControllerState,
+    state: &mut ControllerState,
     frame: &RobotFrame,
 ) -> anyhow::Result<ControllerOutput> {
     let input = ControllerInput {
@@ -106,7 +109,7 @@ fn rest(robot: &Robot) -> RobotFrame {
 struct Fixture {
     server: TestServer,
     controller: Controller,
-    _weights: tempfile::TempDir,
+    weights: TempDir,
 }
 
 fn fixture() -> anyhow::Result<Fixture> {
@@ -115,29 +118,28 @@ fn fixture() -> anyhow::Result<Fixture> {
     Ok(Fixture {
         server: TestServer::start_with(weights.path(), |_| {})?,
         controller,
-        _weights: weights,
+        weights,
     })
 }
 
-async fn raw_client(server: &TestServer) -> anyhow::Result<MotionServiceClient<Channel>> {
-    Ok(MotionServiceClient::connect(server.url()).await?)
+impl Fixture {
+    async fn client(&self) -> anyhow::Result<Client> {
+        Ok(Client::connect(&self.server.url()).await?)
+    }
+
+    async fn raw_client(&self) -> anyhow::Result<MotionServiceClient<Channel>> {
+        self.server.raw_client().await
+    }
+}
+
+fn assert_near(served: &[f32], expected: &[f32]) {
+    emp_tests::assert_near(served, expected, TOLERANCE);
 }
 
 fn assert_equal(served: &PolicyAnswer, expected: &ControllerOutput) {
-    let pairs = [
-        (&served.executable_goal, &expected.goal),
-        (&served.action, &expected.action),
-        (&served.leg_targets, &expected.leg_targets),
-    ];
-    for (served, expected) in pairs {
-        assert_eq!(served.len(), expected.len());
-        for (served, expected) in served.iter().zip(expected) {
-            assert!(
-                (served - expected).abs() <= TOLERANCE,
-                "{served} {expected}"
-            );
-        }
-    }
+    assert_near(&served.executable_goal, &expected.goal);
+    assert_near(&served.action, &expected.action);
+    assert_near(&served.leg_targets, &expected.leg_targets);
 }
 
 /// Streams frames one by one and gives the answers.
@@ -161,13 +163,9 @@ async fn answers(client: &Client, frames: &[RobotFrame]) -> anyhow::Result<Vec<P
 
 #[tokio::test]
 async fn a_stream_answers_as_the_controller_in_process() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = Client::connect(&server.url()).await?;
-    let episode = record(&controller)?;
+    let fixture = fixture()?;
+    let client = fixture.client().await?;
+    let episode = record(&fixture.controller)?;
     let distinct = episode.answers[FRAMES - 1].action[0] - episode.answers[0].action[0];
     assert!(distinct.abs() > 10.0 * TOLERANCE, "the history matters");
     let served = answers(&client, &episode.frames).await?;
@@ -180,68 +178,48 @@ async fn a_stream_answers_as_the_controller_in_process() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn reset_starts_the_episode_anew() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = Client::connect(&server.url()).await?;
-    let mut frames = record(&controller)?.frames;
+    let fixture = fixture()?;
+    let client = fixture.client().await?;
+    let mut frames = record(&fixture.controller)?.frames;
     frames.truncate(20);
     frames[10].reset = true;
     let served = answers(&client, &frames).await?;
-    let mut state = controller.state();
+    let mut state = fixture.controller.state();
     for (served, frame) in served.iter().zip(&frames) {
         if frame.reset {
             state.reset();
         }
-        assert_equal(served, &step(&controller, &mut state, frame)?);
+        assert_equal(served, &step(&fixture.controller, &mut state, frame)?);
     }
     Ok(())
 }
 
 #[tokio::test]
 async fn streams_of_many_robots_keep_their_histories_apart() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = Client::connect(&server.url()).await?;
-    let episode = Arc::new(record(&controller)?);
+    let fixture = fixture()?;
+    let client = fixture.client().await?;
+    let episode = Arc::new(record(&fixture.controller)?);
     let streams = (0..8).map(|start| {
         let (client, episode) = (client.clone(), Arc::clone(&episode));
         tokio::spawn(async move { answers(&client, &episode.frames[start..]).await })
     });
     for (start, stream) in streams.collect::<Vec<_>>().into_iter().enumerate() {
         let served = stream.await??;
-        let mut state = controller.state();
+        let mut state = fixture.controller.state();
         for (served, frame) in served.iter().zip(&episode.frames[start..]) {
-            assert_equal(served, &step(&controller, &mut state, frame)?);
+            assert_equal(served, &step(&fixture.controller, &mut state, frame)?);
         }
     }
     Ok(())
 }
 
 fn wire_state(frame: &RobotFrame) -> v1::RobotState {
-    let q = frame.orientation.cast::<f32>();
-    v1::RobotState {
-        joint_positions: frame.joint_positions.clone(),
-        base_orientation: Some(Quaternion {
-            w: q.w,
-            x: q.i,
-            y: q.j,
-            z: q.k,
-        }),
-    }
+    raw::state(&frame.joint_positions, &frame.orientation)
 }
 
 fn wire_frame(number: u64, frame: &RobotFrame) -> PolicyFrame {
     PolicyFrame {
-        header: Some(v1::FrameHeader {
-            sequence_number: number,
-            ..v1::FrameHeader::default()
-        }),
+        header: Some(raw::header(number)),
         state: Some(wire_state(frame)),
         goal: frame.goal.clone(),
         reset: frame.reset,
@@ -250,13 +228,9 @@ fn wire_frame(number: u64, frame: &RobotFrame) -> PolicyFrame {
 
 #[tokio::test]
 async fn a_single_call_with_the_history_answers_as_the_stream() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let mut client = raw_client(&server).await?;
-    let episode = record(&controller)?;
+    let fixture = fixture()?;
+    let mut client = fixture.raw_client().await?;
+    let episode = record(&fixture.controller)?;
     let heading = episode.frames[0].orientation.euler_angles().2 as f32;
     for now in [0, 5, 14, 15, FRAMES - 1] {
         let first = now.saturating_sub(14);
@@ -277,24 +251,11 @@ async fn a_single_call_with_the_history_answers_as_the_stream() -> anyhow::Resul
         let response = within("an answer", client.step_policy(request)).await??;
         let result = response.into_inner().result.expect("a result");
         let expected = &episode.answers[now];
-        for (served, expected) in result.action.iter().zip(&expected.action) {
-            assert!(
-                (served - expected).abs() <= TOLERANCE,
-                "frame {now}: {served} {expected}"
-            );
-        }
+        assert_near(&result.action, &expected.action);
         assert_eq!(result.leg_targets.len(), expected.leg_targets.len());
         assert_eq!(result.executable_goal, expected.goal);
     }
     Ok(())
-}
-
-fn wrong_field(status: &Status) -> String {
-    assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-    let details = status.get_error_details();
-    details.bad_request().expect("BadRequest").field_violations[0]
-        .field
-        .clone()
 }
 
 /// Frames with one thing wrong each, and the field that is.
@@ -343,34 +304,36 @@ fn bad_frames(good: &RobotFrame) -> Vec<(&'static str, PolicyFrame)> {
     ]
 }
 
-/// A stream without the client library's care.
-struct RawStream {
-    requests: mpsc::Sender<StreamPolicyRequest>,
-    responses: Streaming<v1::StreamPolicyResponse>,
+type PolicyStream = RawStream<StreamPolicyRequest, StreamPolicyResponse>;
+
+async fn open(client: &MotionServiceClient<Channel>) -> anyhow::Result<PolicyStream> {
+    RawStream::open(async |requests| client.clone().stream_policy(requests).await).await
 }
 
-impl RawStream {
-    async fn open(client: &MotionServiceClient<Channel>) -> anyhow::Result<Self> {
-        let (requests, outbound) = mpsc::channel(64);
-        let responses = client
-            .clone()
-            .stream_policy(ReceiverStream::new(outbound))
-            .await?
-            .into_inner();
-        Ok(Self {
-            requests,
-            responses,
-        })
-    }
+async fn started(
+    client: &MotionServiceClient<Channel>,
+    delivery: Delivery,
+) -> anyhow::Result<PolicyStream> {
+    let mut stream = open(client).await?;
+    let config = StreamPolicyConfig {
+        delivery: delivery.into(),
+        ..config("emp27")
+    };
+    stream.send(Request::Config(config)).await;
+    let Ok(Some(Response::Started(started))) = stream.next().await? else {
+        panic!("not started")
+    };
+    assert_eq!(started.history, 15);
+    assert_eq!(started.goal_joint_names.len(), 15);
+    assert_eq!(started.leg_joint_names.len(), 12);
+    Ok(stream)
+}
 
-    async fn send(&self, message: Request) -> anyhow::Result<()> {
-        let message = Some(message);
-        Ok(self.requests.send(StreamPolicyRequest { message }).await?)
-    }
-
-    async fn next(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
-        let response = within("a message", self.responses.message()).await?;
-        Ok(response.map(|response| response.and_then(|response| response.message)))
+/// The result of the frame that was sent last.
+async fn result(stream: &mut PolicyStream) -> anyhow::Result<PolicyResult> {
+    match stream.next().await? {
+        Ok(Some(Response::Result(answered))) => Ok(answered.result.expect("a result")),
+        other => panic!("{other:?}"),
     }
 }
 
@@ -383,29 +346,14 @@ fn config(robot: &str) -> StreamPolicyConfig {
 
 #[tokio::test]
 async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = raw_client(&server).await?;
-    let frames = record(&controller)?.frames;
+    let fixture = fixture()?;
+    let client = fixture.raw_client().await?;
+    let frames = record(&fixture.controller)?.frames;
     for delivery in [Delivery::All, Delivery::Latest] {
-        let mut stream = RawStream::open(&client).await?;
-        let config = StreamPolicyConfig {
-            delivery: delivery.into(),
-            ..config("emp27")
-        };
-        stream.send(Request::Config(config)).await?;
-        let Ok(Some(Response::Started(started))) = stream.next().await? else {
-            panic!("not started")
-        };
-        assert_eq!(started.history, 15);
-        assert_eq!(started.goal_joint_names.len(), 15);
-        assert_eq!(started.leg_joint_names.len(), 12);
-        let mut state = controller.state();
+        let mut stream = started(&client, delivery).await?;
+        let mut state = fixture.controller.state();
         for (frame, (field, bad)) in frames.iter().zip(bad_frames(&frames[0])) {
-            stream.send(Request::Frame(bad)).await?;
+            stream.send(Request::Frame(bad)).await;
             let Ok(Some(Response::Dropped(dropped))) = stream.next().await? else {
                 panic!("{field}: not dropped")
             };
@@ -413,20 +361,9 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
                 (dropped.reason(), dropped.field.as_str()),
                 (DropReason::Invalid, field)
             );
-            stream.send(Request::Frame(wire_frame(7, frame))).await?;
-            let Ok(Some(Response::Result(answered))) = stream.next().await? else {
-                panic!("{field}: the stream lives on")
-            };
-            let expected = step(&controller, &mut state, frame)?;
-            for (served, expected) in answered
-                .result
-                .expect("a result")
-                .action
-                .iter()
-                .zip(&expected.action)
-            {
-                assert!((served - expected).abs() <= TOLERANCE);
-            }
+            stream.send(Request::Frame(wire_frame(7, frame))).await;
+            let expected = step(&fixture.controller, &mut state, frame)?;
+            assert_near(&result(&mut stream).await?.action, &expected.action);
         }
         // The `reset` of a bad frame holds for the frame after it.
         let bad = PolicyFrame {
@@ -434,20 +371,20 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
             reset: true,
             ..wire_frame(0, &frames[0])
         };
-        stream.send(Request::Frame(bad)).await?;
+        stream.send(Request::Frame(bad)).await;
         assert!(matches!(
             stream.next().await?,
             Ok(Some(Response::Dropped(_)))
         ));
         stream
             .send(Request::Frame(wire_frame(8, &frames[30])))
-            .await?;
-        let Ok(Some(Response::Result(answered))) = stream.next().await? else {
-            panic!("the stream lives on")
-        };
-        let expected = step(&controller, &mut controller.state(), &frames[30])?;
-        let served = answered.result.expect("a result").action[0];
-        assert!((served - expected.action[0]).abs() <= TOLERANCE);
+            .await;
+        let anew = step(
+            &fixture.controller,
+            &mut fixture.controller.state(),
+            &frames[30],
+        )?;
+        assert_near(&result(&mut stream).await?.action, &anew.action);
     }
     Ok(())
 }
@@ -456,32 +393,18 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
 /// each answer with a history in which that `reset` held for the next frame that was computed.
 #[tokio::test]
 async fn the_reset_of_a_superseded_frame_holds() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let mut stream = RawStream::open(&raw_client(&server).await?).await?;
-    let config = StreamPolicyConfig {
-        delivery: Delivery::Latest.into(),
-        ..config("emp27")
-    };
-    stream.send(Request::Config(config)).await?;
-    assert!(matches!(
-        stream.next().await?,
-        Ok(Some(Response::Started(_)))
-    ));
-    let mut state = controller.state();
-    let mut frames = record(&controller)?.frames;
+    let fixture = fixture()?;
+    let client = fixture.raw_client().await?;
+    let mut stream = started(&client, Delivery::Latest).await?;
+    let mut state = fixture.controller.state();
+    let mut frames = record(&fixture.controller)?.frames;
     for frame in frames.iter_mut().skip(10).step_by(7) {
         frame.reset = true;
     }
     let mut held = false;
     for _burst in 0..200 {
         for (number, frame) in (0..).zip(&frames) {
-            stream
-                .send(Request::Frame(wire_frame(number, frame)))
-                .await?;
+            stream.send(Request::Frame(wire_frame(number, frame))).await;
         }
         let mut superseded = 0;
         let mut results = Vec::new();
@@ -505,10 +428,8 @@ async fn the_reset_of_a_superseded_frame_holds() -> anyhow::Result<()> {
             if skipped || frames[number].reset {
                 state.reset();
             }
-            let expected = step(&controller, &mut state, &frames[number])?;
-            for (served, expected) in result.action.iter().zip(&expected.action) {
-                assert!((served - expected).abs() <= TOLERANCE);
-            }
+            let expected = step(&fixture.controller, &mut state, &frames[number])?;
+            assert_near(&result.action, &expected.action);
             next = number + 1;
         }
         assert_eq!(next, FRAMES, "the newest frame is always answered");
@@ -521,36 +442,25 @@ async fn the_reset_of_a_superseded_frame_holds() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn bad_configs_end_the_stream_by_field() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = raw_client(&server).await?;
-    let frame = || Request::Frame(wire_frame(0, &rest(controller.policy().robot())));
+    let fixture = fixture()?;
+    let client = fixture.raw_client().await?;
+    let frame = || Request::Frame(wire_frame(0, &rest(fixture.controller.policy().robot())));
+    let changed = |change: &dyn Fn(&mut StreamPolicyConfig)| {
+        let mut config = config("emp27");
+        change(&mut config);
+        vec![Request::Config(config)]
+    };
     let cases = [
         ("robot", vec![Request::Config(config("nobody"))]),
         (
             "model",
-            vec![Request::Config(StreamPolicyConfig {
-                model: "emp27-retargeter".to_owned(),
-                ..config("emp27")
-            })],
+            changed(&|config| config.model = "emp27-retargeter".to_owned()),
         ),
         (
             "model_version",
-            vec![Request::Config(StreamPolicyConfig {
-                model_version: "0".to_owned(),
-                ..config("emp27")
-            })],
+            changed(&|config| config.model_version = "0".to_owned()),
         ),
-        (
-            "config.delivery",
-            vec![Request::Config(StreamPolicyConfig {
-                delivery: 99,
-                ..config("emp27")
-            })],
-        ),
+        ("config.delivery", changed(&|config| config.delivery = 99)),
         ("config", vec![frame()]),
         (
             "config",
@@ -561,17 +471,15 @@ async fn bad_configs_end_the_stream_by_field() -> anyhow::Result<()> {
         ),
     ];
     for (field, messages) in cases {
-        let mut stream = RawStream::open(&client).await?;
+        let mut stream = open(&client).await?;
         for message in messages {
-            stream.send(message).await?;
+            stream.send(message).await;
         }
-        let status = loop {
-            match stream.next().await? {
-                Ok(Some(Response::Started(_))) => {}
-                Ok(other) => panic!("{field}: {other:?}"),
-                Err(status) => break status,
-            }
-        };
+        let (before, status) = stream.failure().await?;
+        assert!(
+            before.iter().all(|m| matches!(m, Response::Started(_))),
+            "{field}: {before:?}"
+        );
         assert_eq!(wrong_field(&status), field);
     }
     Ok(())
@@ -579,13 +487,9 @@ async fn bad_configs_end_the_stream_by_field() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn single_calls_are_refused_by_field() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let mut client = raw_client(&server).await?;
-    let good = rest(controller.policy().robot());
+    let fixture = fixture()?;
+    let mut client = fixture.raw_client().await?;
+    let good = rest(fixture.controller.policy().robot());
     let observation = |frame: &PolicyFrame| PolicyObservation {
         state: frame.state.clone(),
         goal: frame.goal.clone(),
@@ -664,15 +568,14 @@ async fn a_robot_without_a_policy_says_so() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn policies_are_listed_beside_retargeters() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = Client::connect(&server.url()).await?;
+    let fixture = fixture()?;
+    let client = fixture.client().await?;
     let model = client.model("emp27-policy").await?;
     assert_eq!(model.kind(), v1::ModelKind::Policy);
-    assert_eq!(model.version, controller.policy().metadata().version());
+    assert_eq!(
+        model.version,
+        fixture.controller.policy().metadata().version()
+    );
     let robot = emp27()?;
     let legs = robot.leg_joints().iter().map(|joint| &joint.name);
     assert!(legs.eq(&model.joint_names));
@@ -688,35 +591,28 @@ async fn policies_are_listed_beside_retargeters() -> anyhow::Result<()> {
 
 #[tokio::test]
 async fn a_lost_connection_starts_a_new_episode() -> anyhow::Result<()> {
-    let Fixture {
-        server,
-        controller,
-        _weights,
-    } = fixture()?;
-    let client = Client::connect(&server.url()).await?;
+    let fixture = fixture()?;
+    let client = fixture.client().await?;
     let (mut sender, mut events) = client
         .policy_stream(PolicyConfig {
             delivery: Delivery::Latest,
             ..PolicyConfig::for_robot("emp27")
         })
         .await?;
-    let frames = record(&controller)?.frames;
+    let frames = record(&fixture.controller)?.frames;
     sender.send(&frames[0], None).await?;
     assert!(matches!(
         within("an answer", events.next()).await??,
         Some(Event::Answer(_))
     ));
+    let Fixture {
+        server,
+        controller,
+        weights,
+    } = fixture;
     let port = server.port();
     server.kill();
-    let weights = _weights;
-    let mut settings = emp_server::Settings {
-        robots: Some(emp_tests::root().join("robots")),
-        weights: Some(weights.path().to_owned()),
-        ..emp_server::Settings::default()
-    };
-    settings.listen.set_port(port);
-    let catalog = emp_server::Catalog::load(&settings)?;
-    let _server = TestServer::start_on(port, settings, catalog)?;
+    let _server = TestServer::start_with_on(port, weights.path(), |_| {})?;
     loop {
         match within("the connection", events.next()).await?? {
             Some(Event::Reconnected { .. }) => break,
@@ -729,9 +625,7 @@ async fn a_lost_connection_starts_a_new_episode() -> anyhow::Result<()> {
         panic!("unanswered")
     };
     assert_ne!(answer.sequence_number, 0);
-    assert_equal(
-        &answer,
-        &step(&controller, &mut controller.state(), &frames[40])?,
-    );
+    let anew = step(&controller, &mut controller.state(), &frames[40])?;
+    assert_equal(&answer, &anew);
     Ok(())
 }

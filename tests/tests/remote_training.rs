@@ -113,13 +113,7 @@ fn a_server_that_comes_back_goes_on_where_it_was() -> anyhow::Result<()> {
     let restarted = std::thread::spawn(move || {
         // The learner finds nobody at first.
         std::thread::sleep(Duration::from_millis(300));
-        let settings = emp_server::Settings {
-            robots: Some(root().join("robots")),
-            weights: Some(weights()?),
-            ..emp_server::Settings::default()
-        };
-        let catalog = emp_server::Catalog::load(&settings)?;
-        TestServer::start_on(port, settings, catalog)
+        TestServer::start_with_on(port, &weights()?, |_| {})
     });
     let served = collect(&mut there, &snapshot)?;
     assert_same(&served, &collect(&mut here, &snapshot)?);

@@ -21,7 +21,11 @@ use emp_sim::{
     goals::{GoalClip, GoalLibrary, Source},
     metrics::Interval,
 };
-use emp_tests::{TestServer, emp27, fake, policy, raw, within};
+use emp_tests::{
+    TestServer, emp27, fake, policy,
+    raw::{self, wrong_field},
+    within,
+};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Request, Status, metadata::MetadataValue};
 use tonic_types::StatusExt as _;
@@ -109,17 +113,6 @@ async fn refusal(mut evaluation: Evaluation) -> anyhow::Result<Status> {
             Err(error) => panic!("{error}"),
         }
     }
-}
-
-fn wrong_field(status: &Status) -> String {
-    assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-    status
-        .get_error_details()
-        .bad_request()
-        .expect("BadRequest")
-        .field_violations[0]
-        .field
-        .clone()
 }
 
 fn assert_close(served: Option<Metric>, here: Interval, tolerance: f64) {

@@ -4,44 +4,54 @@ use std::collections::BTreeSet;
 
 use emp_client::{Client, Delivery, DropCause, DropReason, Event, StreamConfig, StreamEvents};
 use emp_proto::v1::{
-    HumanPose, Position, StreamRetargetRequest, motion_service_client::MotionServiceClient,
-    stream_retarget_response::Message,
+    HumanPose, Position, RetargetFrame, StreamRetargetConfig, StreamRetargetRequest,
+    StreamRetargetResponse, motion_service_client::MotionServiceClient,
+    stream_retarget_request::Message as Outgoing, stream_retarget_response::Message,
 };
 use emp_server::Settings;
 use emp_tests::{
     TestServer, emp27,
     fake::{self, Gate},
     poses,
-    raw::{self, RawStream},
+    raw::{self, RawStream, wrong_field},
     within,
 };
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Request, metadata::MetadataValue, transport::Channel};
 use tonic_types::StatusExt as _;
 
-fn fake_server(settings: Settings, gate: &Gate) -> anyhow::Result<TestServer> {
-    let catalog = fake::catalog(&settings, &emp27()?, gate)?;
-    TestServer::start(settings, catalog)
-}
-
-async fn raw_client(server: &TestServer) -> MotionServiceClient<Channel> {
-    MotionServiceClient::connect(server.url())
-        .await
-        .expect("connected")
-}
-
 async fn next(events: &mut StreamEvents) -> anyhow::Result<Option<Event>> {
     Ok(within("an event", events.next()).await??)
+}
+
+fn config(robot: &str, delivery: i32) -> Outgoing {
+    Outgoing::Config(StreamRetargetConfig {
+        robot: robot.to_owned(),
+        delivery,
+        ..StreamRetargetConfig::default()
+    })
+}
+
+fn frame(number: u64, pose: HumanPose) -> Outgoing {
+    Outgoing::Frame(RetargetFrame {
+        header: Some(raw::header(number)),
+        pose: Some(pose),
+    })
+}
+
+type PoseStream = RawStream<StreamRetargetRequest, StreamRetargetResponse>;
+
+async fn open(client: &MotionServiceClient<Channel>) -> anyhow::Result<PoseStream> {
+    RawStream::open(async |requests| client.clone().stream_retarget(requests).await).await
 }
 
 /// Opens a raw stream and reads its `started`.
 async fn started(
     client: &MotionServiceClient<Channel>,
     delivery: Delivery,
-) -> anyhow::Result<RawStream> {
-    let mut stream = RawStream::open(client).await?;
-    stream.send(raw::config("emp27", delivery)).await;
-    let first = within("`started`", stream.next()).await??;
+) -> anyhow::Result<PoseStream> {
+    let mut stream = open(client).await?;
+    stream.send(config("emp27", delivery.into())).await;
+    let first = stream.next().await??;
     assert!(matches!(first, Some(Message::Started(_))), "{first:?}");
     Ok(stream)
 }
@@ -89,7 +99,7 @@ async fn all_answers_every_frame_in_order_and_half_close_flushes() -> anyhow::Re
 #[tokio::test]
 async fn latest_keeps_the_newest_frame_and_reports_the_others() -> anyhow::Result<()> {
     let gate = Gate::closed();
-    let server = fake_server(Settings::default(), &gate)?;
+    let server = fake::server(Settings::default(), &gate)?;
     let client = Client::connect(&server.url()).await?;
     let config = StreamConfig {
         delivery: Delivery::Latest,
@@ -126,7 +136,7 @@ async fn latest_keeps_the_newest_frame_and_reports_the_others() -> anyhow::Resul
 #[tokio::test]
 async fn latest_replaces_a_frame_that_waits_in_the_models_queue() -> anyhow::Result<()> {
     let gate = Gate::closed();
-    let server = fake_server(Settings::default(), &gate)?;
+    let server = fake::server(Settings::default(), &gate)?;
     let client = Client::connect(&server.url()).await?;
     let config = StreamConfig {
         delivery: Delivery::Latest,
@@ -158,8 +168,8 @@ async fn latest_replaces_a_frame_that_waits_in_the_models_queue() -> anyhow::Res
 
 #[tokio::test]
 async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyhow::Result<()> {
-    let server = fake_server(Settings::default(), &Gate::open())?;
-    let client = raw_client(&server).await;
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let client = server.raw_client().await?;
     let good = || raw::pose(&fake::pose(0.25));
     let nan = Some(Position {
         x: 0.0,
@@ -189,9 +199,9 @@ async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyh
     for delivery in [Delivery::All, Delivery::Latest] {
         let mut stream = started(&client, delivery).await?;
         for (number, (pose, wrong)) in (0..).zip(&frames) {
-            stream.send(raw::frame(number, *pose)).await;
+            stream.send(frame(number, *pose)).await;
             // One at a time, so that `LATEST` supersedes nothing.
-            match (within("an answer", stream.next()).await??, wrong) {
+            match (stream.next().await??, wrong) {
                 (Some(Message::Result(answered)), None) => {
                     assert_eq!(answered.header.expect("a header").sequence_number, number);
                     assert_eq!(answered.result.expect("a result").joint_angles[0], 0.25);
@@ -205,16 +215,16 @@ async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyh
             }
         }
         stream.finish();
-        assert_eq!(within("the end", stream.next()).await??, None);
+        assert_eq!(stream.next().await??, None);
     }
     // Sent at once, `ALL` keeps even the notices in order.
     let mut stream = started(&client, Delivery::All).await?;
     for (number, (pose, _)) in (0..).zip(&frames) {
-        stream.send(raw::frame(number, *pose)).await;
+        stream.send(frame(number, *pose)).await;
     }
     stream.finish();
     let mut numbers = Vec::new();
-    while let Some(message) = within("an answer", stream.next()).await?? {
+    while let Some(message) = stream.next().await?? {
         let header = match message {
             Message::Result(answered) => answered.header,
             Message::Dropped(dropped) => dropped.header,
@@ -228,98 +238,57 @@ async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyh
 
 #[tokio::test]
 async fn a_bad_config_ends_the_stream() -> anyhow::Result<()> {
-    let server = fake_server(Settings::default(), &Gate::open())?;
-    let client = raw_client(&server).await;
-    let unknown_delivery = {
-        let mut config = raw::config("emp27", Delivery::All);
-        if let Some(emp_proto::v1::stream_retarget_request::Message::Config(config)) =
-            &mut config.message
-        {
-            config.delivery = 99;
-        }
-        config
-    };
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let client = server.raw_client().await?;
+    let good = || Some(config("emp27", Delivery::All.into()));
     let cases = [
-        ("robot", vec![raw::config("nobody", Delivery::All)]),
-        ("config.delivery", vec![unknown_delivery]),
-        ("config", vec![raw::frame(0, raw::pose(&fake::pose(0.0)))]),
-        ("config", vec![StreamRetargetRequest::default()]),
-        (
-            "config",
-            vec![
-                raw::config("emp27", Delivery::All),
-                raw::config("emp27", Delivery::All),
-            ],
-        ),
-        (
-            "message",
-            vec![
-                raw::config("emp27", Delivery::All),
-                StreamRetargetRequest::default(),
-            ],
-        ),
+        ("robot", vec![Some(config("nobody", Delivery::All.into()))]),
+        ("config.delivery", vec![Some(config("emp27", 99))]),
+        ("config", vec![Some(frame(0, raw::pose(&fake::pose(0.0))))]),
+        ("config", vec![None]),
+        ("config", vec![good(), good()]),
+        ("message", vec![good(), None]),
     ];
     for (field, messages) in cases {
-        let mut stream = RawStream::open(&client).await?;
+        let mut stream = open(&client).await?;
         for message in messages {
             stream.send(message).await;
         }
-        let status = loop {
-            match within("the end", stream.next()).await? {
-                Ok(Some(Message::Started(_))) => {}
-                Ok(other) => panic!("{field}: {other:?}"),
-                Err(status) => break status,
-            }
-        };
-        assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-        assert_eq!(
-            status
-                .get_error_details()
-                .bad_request()
-                .expect("BadRequest")
-                .field_violations[0]
-                .field,
-            field
+        let (before, status) = stream.failure().await?;
+        assert!(
+            before.iter().all(|m| matches!(m, Message::Started(_))),
+            "{field}: {before:?}"
         );
+        assert_eq!(wrong_field(&status), field);
     }
     // Without any message at all, too.
-    let mut stream = RawStream::open(&client).await?;
+    let mut stream = open(&client).await?;
     stream.finish();
-    assert_eq!(
-        within("the end", stream.next())
-            .await?
-            .expect_err("no config")
-            .code(),
-        Code::InvalidArgument
-    );
+    let status = stream.next().await?.expect_err("no config");
+    assert_eq!(status.code(), Code::InvalidArgument);
     Ok(())
 }
 
 #[tokio::test]
 async fn an_oversize_message_ends_its_stream_only() -> anyhow::Result<()> {
-    let server = fake_server(Settings::default(), &Gate::open())?;
-    let client = raw_client(&server).await;
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let client = server.raw_client().await?;
     let mut other = started(&client, Delivery::All).await?;
     let mut stream = started(&client, Delivery::All).await?;
     stream
-        .send(raw::config(&"x".repeat(300 << 10), Delivery::All))
+        .send(config(&"x".repeat(300 << 10), Delivery::All.into()))
         .await;
-    let status = within("the end", stream.next())
-        .await?
-        .expect_err("too large");
+    let status = stream.next().await?.expect_err("too large");
     assert_eq!(status.code(), Code::OutOfRange, "{status:?}");
-    other.send(raw::frame(0, raw::pose(&fake::pose(0.0)))).await;
-    assert!(matches!(
-        within("an answer", other.next()).await??,
-        Some(Message::Result(_))
-    ));
+    other.send(frame(0, raw::pose(&fake::pose(0.0)))).await;
+    assert!(matches!(other.next().await??, Some(Message::Result(_))));
     Ok(())
 }
 
 #[tokio::test]
 async fn a_frame_whose_budget_runs_out_is_dropped_and_the_stream_lives() -> anyhow::Result<()> {
     let gate = Gate::closed();
-    let server = fake_server(Settings::default(), &gate)?;
+    let server = fake::server(Settings::default(), &gate)?;
     let client = Client::connect(&server.url()).await?;
     let (mut sender, mut events) = client.stream(StreamConfig::for_robot("emp27")).await?;
     let budget = std::time::Duration::from_millis(20);
@@ -347,18 +316,18 @@ async fn a_frame_whose_budget_runs_out_is_dropped_and_the_stream_lives() -> anyh
 
 #[tokio::test]
 async fn a_streams_own_deadline_ends_it() -> anyhow::Result<()> {
-    let server = fake_server(Settings::default(), &Gate::open())?;
-    let mut client = raw_client(&server).await;
-    let (requests, outbound) = tokio::sync::mpsc::channel(4);
-    requests.send(raw::config("emp27", Delivery::All)).await?;
-    let mut call = Request::new(ReceiverStream::new(outbound));
-    call.metadata_mut()
-        .insert("grpc-timeout", MetadataValue::from_static("300m"));
-    let mut responses = client.stream_retarget(call).await?.into_inner();
-    assert!(responses.message().await?.is_some(), "it starts");
-    let status = within("the deadline", responses.message())
-        .await?
-        .expect_err("late");
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let mut client = server.raw_client().await?;
+    let mut stream = PoseStream::open(async |requests| {
+        let mut call = Request::new(requests);
+        call.metadata_mut()
+            .insert("grpc-timeout", MetadataValue::from_static("300m"));
+        client.stream_retarget(call).await
+    })
+    .await?;
+    stream.send(config("emp27", Delivery::All.into())).await;
+    assert!(stream.next().await??.is_some(), "it starts");
+    let status = stream.next().await?.expect_err("late");
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
     Ok(())
 }
@@ -368,7 +337,7 @@ async fn a_cancelled_stream_gives_its_place_back_and_costs_no_more() -> anyhow::
     let gate = Gate::closed();
     let mut settings = Settings::default();
     settings.streams.max_open = 1.try_into()?;
-    let server = fake_server(settings, &gate)?;
+    let server = fake::server(settings, &gate)?;
     let client = Client::connect(&server.url()).await?;
     let (mut sender, events) = client.stream(StreamConfig::for_robot("emp27")).await?;
     for _ in 0..5 {
@@ -409,13 +378,13 @@ async fn under_overload_open_streams_lose_frames_and_new_ones_are_refused() -> a
     let gate = Gate::closed();
     let mut settings = Settings::default();
     settings.batching.queue = 1.try_into()?;
-    let server = fake_server(settings, &gate)?;
-    let client = raw_client(&server).await;
+    let server = fake::server(settings, &gate)?;
+    let client = server.raw_client().await?;
     let mut streams = Vec::new();
     for _ in 0..3 {
         streams.push(started(&client, Delivery::All).await?);
     }
-    let frame = || raw::frame(0, raw::pose(&fake::pose(0.0)));
+    let frame = || frame(0, raw::pose(&fake::pose(0.0)));
     streams[0].send(frame()).await;
     within("the model to be busy", gate.has_entered(1)).await?;
     // One of the two waits in the queue, the other finds it full.
@@ -431,16 +400,14 @@ async fn under_overload_open_streams_lose_frames_and_new_ones_are_refused() -> a
         }
     })
     .await?;
-    let Some(Message::Dropped(dropped)) = dropped? else {
+    let Some(Message::Dropped(dropped)) = dropped?? else {
         panic!("not dropped")
     };
     assert_eq!(dropped.reason(), DropReason::Overloaded);
 
-    let mut late = RawStream::open(&client).await?;
-    late.send(raw::config("emp27", Delivery::All)).await;
-    let status = within("a refusal", late.next())
-        .await?
-        .expect_err("overloaded");
+    let mut late = open(&client).await?;
+    late.send(config("emp27", Delivery::All.into())).await;
+    let status = late.next().await?.expect_err("overloaded");
     assert_eq!(status.code(), Code::ResourceExhausted);
     assert!(status.get_error_details().retry_info().is_some());
 
@@ -448,13 +415,13 @@ async fn under_overload_open_streams_lose_frames_and_new_ones_are_refused() -> a
     // Once the others are answered there is room again.
     for index in [0, 3 - lost] {
         assert!(matches!(
-            within("an answer", streams[index].next()).await??,
+            streams[index].next().await??,
             Some(Message::Result(_))
         ));
     }
     streams[lost].send(frame()).await;
     assert!(matches!(
-        within("an answer", streams[lost].next()).await??,
+        streams[lost].next().await??,
         Some(Message::Result(_))
     ));
     Ok(())

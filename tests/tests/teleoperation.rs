@@ -14,24 +14,22 @@ use emp_client::{
 };
 use emp_motion::{KeyNodeFrame, key_nodes, skills};
 use emp_proto::v1::{
-    self, DropReason, FrameHeader, HumanPose, Quaternion, RobotState, TeleoperateConfig,
-    TeleoperateRequest, TeleoperateResponse, TeleoperationRole,
-    motion_service_client::MotionServiceClient, teleoperate_request::Message as Request,
+    self, DropReason, FrameHeader, HumanPose, RobotState, TeleoperateConfig, TeleoperateRequest,
+    TeleoperateResponse, TeleoperationRole, teleoperate_request::Message as Request,
     teleoperate_response::Message as Response,
 };
 use emp_robot::Robot;
 use emp_sim::{Body, BodyParameters, Stage, Start, Targets};
 use emp_tests::{
-    TestServer, emp, emp27, fake, policy,
+    TestServer, assert_near, emp, emp27, fake, policy,
     process::{ServerProcess, binaries},
-    raw, within,
+    raw::{self, RawStream},
+    within,
 };
 use nalgebra::UnitQuaternion;
 use serde_json::Value;
 use tempfile::TempDir;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming, transport::Channel};
+use tonic::{Code, Status};
 
 /// Control periods of a ramp of the test server.
 const RAMP: usize = 10;
@@ -85,13 +83,6 @@ fn measured(frame: &TeleoperationFrame) -> Vec<f32> {
 /// A person with one arm at an angle, −0.5 to 0.5.
 fn pose(angle: f32) -> KeyNodeFrame {
     fake::pose(angle)
-}
-
-fn assert_near(a: &[f32], b: &[f32], tolerance: f32) {
-    assert_eq!(a.len(), b.len());
-    for (a, b) in a.iter().zip(b) {
-        assert!((a - b).abs() <= tolerance, "{a} {b}");
-    }
 }
 
 /// The end of a session with the robot.
@@ -534,55 +525,40 @@ async fn a_jump_of_the_pose_is_limited_in_speed() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A stream as any gRPC client would open it.
-struct RawStream {
-    requests: Option<mpsc::Sender<TeleoperateRequest>>,
-    responses: Streaming<TeleoperateResponse>,
+type RawSession = RawStream<TeleoperateRequest, TeleoperateResponse>;
+
+/// Joins a session as any gRPC client would.
+async fn open(server: &TestServer, config: TeleoperateConfig) -> anyhow::Result<RawSession> {
+    let mut client = server.raw_client().await?;
+    let stream = RawStream::open(async |requests| client.teleoperate(requests).await).await?;
+    stream.send(Request::Config(config)).await;
+    Ok(stream)
 }
 
-impl RawStream {
-    async fn open(server: &TestServer, config: TeleoperateConfig) -> anyhow::Result<Self> {
-        let mut client: MotionServiceClient<Channel> =
-            MotionServiceClient::connect(server.url()).await?;
-        let (requests, outbound) = mpsc::channel(64);
-        let config = Request::Config(config);
-        let message = Some(config);
-        requests.send(TeleoperateRequest { message }).await?;
-        let call = client.teleoperate(ReceiverStream::new(outbound));
-        let responses = within("the headers", call).await??.into_inner();
-        Ok(Self {
-            requests: Some(requests),
-            responses,
-        })
-    }
+/// [`open`] for a config that is accepted.
+async fn started(server: &TestServer, config: TeleoperateConfig) -> anyhow::Result<RawSession> {
+    let mut stream = open(server, config).await?;
+    let first = stream.next().await?;
+    assert!(matches!(first, Ok(Some(Response::Started(_)))), "{first:?}");
+    Ok(stream)
+}
 
-    async fn send(&self, number: u64, mut frame: v1::TeleoperationFrame) -> anyhow::Result<()> {
-        let mut header = frame.header.unwrap_or_default();
-        header.sequence_number = number;
-        frame.header = Some(header);
-        let message = Some(Request::Frame(frame));
-        let requests = self.requests.as_ref().expect("an open stream");
-        Ok(requests.send(TeleoperateRequest { message }).await?)
-    }
+async fn send_frame(stream: &RawSession, number: u64, mut frame: v1::TeleoperationFrame) {
+    let mut header = frame.header.unwrap_or_default();
+    header.sequence_number = number;
+    frame.header = Some(header);
+    stream.send(Request::Frame(frame)).await;
+}
 
-    async fn next(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
-        let response = within("a message", self.responses.message()).await?;
-        Ok(response.map(|response| response.and_then(|response| response.message)))
-    }
-
-    /// The next message that does not tell who came or went, which may come at any time.
-    async fn next_but_presence(&mut self) -> anyhow::Result<Result<Option<Response>, Status>> {
-        loop {
-            let message = self.next().await?;
-            if !matches!(message, Ok(Some(Response::Presence(_)))) {
-                return Ok(message);
-            }
+/// The next message that does not tell who came or went, which may come at any time.
+async fn next_but_presence(
+    stream: &mut RawSession,
+) -> anyhow::Result<Result<Option<Response>, Status>> {
+    loop {
+        let message = stream.next().await?;
+        if !matches!(message, Ok(Some(Response::Presence(_)))) {
+            return Ok(message);
         }
-    }
-
-    async fn started(&mut self) -> anyhow::Result<()> {
-        assert!(matches!(self.next().await?, Ok(Some(Response::Started(_)))));
-        Ok(())
     }
 }
 
@@ -596,16 +572,7 @@ fn raw_config(session: &str, role: TeleoperationRole) -> TeleoperateConfig {
 }
 
 fn raw_state(frame: &TeleoperationFrame) -> RobotState {
-    let q = frame.orientation.cast::<f32>();
-    RobotState {
-        joint_positions: frame.joint_positions.clone(),
-        base_orientation: Some(Quaternion {
-            w: q.w,
-            x: q.i,
-            y: q.j,
-            z: q.k,
-        }),
-    }
+    raw::state(&frame.joint_positions, &frame.orientation)
 }
 
 fn frame_of(pose: Option<HumanPose>, state: Option<RobotState>) -> v1::TeleoperationFrame {
@@ -636,7 +603,7 @@ async fn a_bad_config_is_refused_by_name() -> anyhow::Result<()> {
     for (field, change) in bad {
         let mut config = raw_config("lab", TeleoperationRole::Robot);
         change(&mut config);
-        let mut stream = RawStream::open(&server, config).await?;
+        let mut stream = open(&server, config).await?;
         let status = stream.next().await?.expect_err("refused");
         assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
         assert!(status.message().starts_with(field), "{field}: {status:?}");
@@ -701,11 +668,10 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
         (TeleoperationRole::Both, both),
         (TeleoperationRole::Observer, observers),
     ] {
-        let mut stream = RawStream::open(&server, raw_config("lab", role)).await?;
-        stream.started().await?;
+        let mut stream = started(&server, raw_config("lab", role)).await?;
         for (number, (field, frame)) in frames.into_iter().enumerate() {
-            stream.send(number as u64, frame).await?;
-            let answer = stream.next_but_presence().await?;
+            send_frame(&stream, number as u64, frame).await;
+            let answer = next_but_presence(&mut stream).await?;
             let Ok(Some(Response::Dropped(dropped))) = answer else {
                 panic!("{role:?}: {field} is not refused but {answer:?}")
             };
@@ -719,10 +685,8 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
             );
         }
         if matches!(role, TeleoperationRole::Robot | TeleoperationRole::Both) {
-            stream
-                .send(99, frame_of(None, Some(raw_state(&good))))
-                .await?;
-            let answer = stream.next_but_presence().await?;
+            send_frame(&stream, 99, frame_of(None, Some(raw_state(&good)))).await;
+            let answer = next_but_presence(&mut stream).await?;
             assert!(
                 matches!(answer, Ok(Some(Response::Result(_)))),
                 "{answer:?}"
@@ -738,9 +702,7 @@ async fn a_pose_that_cannot_be_retargeted_in_time_is_not_used() -> anyhow::Resul
     let server = server_with(&weights)?;
     let client = Client::connect(&server.url()).await?;
     let mut end = RobotEnd::join(&client, "lab").await?;
-    let mut operator =
-        RawStream::open(&server, raw_config("lab", TeleoperationRole::Operator)).await?;
-    operator.started().await?;
+    let operator = started(&server, raw_config("lab", TeleoperationRole::Operator)).await?;
     let late = v1::TeleoperationFrame {
         header: Some(FrameHeader {
             time_budget: Some(prost_types::Duration::default()),
@@ -748,7 +710,7 @@ async fn a_pose_that_cannot_be_retargeted_in_time_is_not_used() -> anyhow::Resul
         }),
         ..frame_of(Some(raw::pose(&pose(0.3))), None)
     };
-    operator.send(7, late).await?;
+    send_frame(&operator, 7, late).await;
     let frame = still(&*emp27()?, 0.0);
     loop {
         let result = end.step(&frame).await?;
@@ -777,14 +739,11 @@ async fn with_latest_every_frame_is_answered_or_superseded() -> anyhow::Result<(
         delivery: Delivery::Latest.into(),
         ..raw_config("lab", TeleoperationRole::Robot)
     };
-    let mut stream = RawStream::open(&server, config).await?;
-    stream.started().await?;
+    let mut stream = started(&server, config).await?;
     for number in 0..40 {
-        stream
-            .send(number, frame_of(None, Some(raw_state(&frame))))
-            .await?;
+        send_frame(&stream, number, frame_of(None, Some(raw_state(&frame)))).await;
     }
-    stream.requests = None;
+    stream.finish();
     let (mut seen, mut last) = (Vec::new(), None);
     while let Some(message) = stream.next().await?? {
         let header = match message {
@@ -813,10 +772,8 @@ async fn with_latest_every_frame_is_answered_or_superseded() -> anyhow::Result<(
 #[tokio::test]
 async fn an_observer_who_half_closed_still_hears() -> anyhow::Result<()> {
     let (server, _weights) = server()?;
-    let mut observer =
-        RawStream::open(&server, raw_config("lab", TeleoperationRole::Observer)).await?;
-    observer.started().await?;
-    observer.requests = None;
+    let mut observer = started(&server, raw_config("lab", TeleoperationRole::Observer)).await?;
+    observer.finish();
     let client = Client::connect(&server.url()).await?;
     let mut end = RobotEnd::join(&client, "lab").await?;
     let presence = observer.next().await?;
@@ -839,13 +796,9 @@ async fn a_server_that_drains_ends_every_end() -> anyhow::Result<()> {
         TeleoperationRole::Operator,
         TeleoperationRole::Observer,
     ] {
-        let mut stream = RawStream::open(&server, raw_config("lab", role)).await?;
-        stream.started().await?;
-        streams.push(stream);
+        streams.push(started(&server, raw_config("lab", role)).await?);
     }
-    streams[0]
-        .send(0, frame_of(None, Some(raw_state(&frame))))
-        .await?;
+    send_frame(&streams[0], 0, frame_of(None, Some(raw_state(&frame)))).await;
     let answer = match streams[0].next().await? {
         Ok(Some(Response::Result(result))) => result,
         other => panic!("{other:?}"),
@@ -853,13 +806,7 @@ async fn a_server_that_drains_ends_every_end() -> anyhow::Result<()> {
     assert_eq!(answer.leg_targets.len(), 12);
     server.begin_shutdown();
     for stream in &mut streams {
-        let status = loop {
-            match stream.next().await? {
-                Ok(Some(_)) => {}
-                Ok(None) => panic!("it ended without a reason"),
-                Err(status) => break status,
-            }
-        };
+        let (_, status) = stream.failure().await?;
         assert_eq!(status.code(), Code::Unavailable, "{status:?}");
     }
     drop(streams);

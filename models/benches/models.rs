@@ -10,7 +10,8 @@ use emp_models::{
     emp::{EmpConfig, EmpNetwork},
     kinematics::ForwardKinematics,
     linear::{self, Linear},
-    policy::{Normalizer, Policy},
+    mlp::Normalizer,
+    policy::Policy,
     retarget::{Effort, RetargetInput, Retargeter, Solver, Target},
 };
 use emp_motion::skills;

@@ -21,7 +21,7 @@ use candle_nn::{VarBuilder, VarMap};
 use emp_models::{
     emp::{EmpConfig, EmpNetwork, PackedNetwork},
     linear,
-    policy::Normalizer,
+    mlp::Normalizer,
 };
 use emp_robot::Robot;
 

@@ -15,6 +15,7 @@ pub mod filters;
 pub mod guard;
 pub mod kinematics;
 pub mod linear;
+pub mod mlp;
 pub mod observation;
 pub mod optimizer;
 pub mod packed;

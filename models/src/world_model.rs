@@ -19,8 +19,8 @@ use serde::{Deserialize, Serialize};
 use crate::{
     CheckpointMetadata, ModelError,
     checkpoint::{self, Tensors},
+    mlp::{Mlp, Normalizer},
     observation::{HISTORY, HistoryMap, ObservationLayout},
-    policy::{Mlp, Normalizer},
 };
 
 /// The kind that a world model's checkpoint names.

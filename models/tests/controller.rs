@@ -9,8 +9,9 @@ use emp_models::{
     checkpoint::Tensors,
     controller::{Controller, ControllerInput, ControllerState, FilterItem, GoalFilter},
     guard::{ExecutionGuard, GuardSettings},
+    mlp::{Mlp, Normalizer},
     observation::RobotState,
-    policy::{Mlp, Normalizer, Policy, PolicyConfig},
+    policy::{Policy, PolicyConfig},
 };
 use emp_robot::Robot;
 use nalgebra::UnitQuaternion;

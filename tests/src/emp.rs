@@ -5,8 +5,8 @@ use std::{path::Path, sync::Arc};
 use emp_models::{
     checkpoint::Tensors,
     emp::{DangerGate, Emp, EmpConfig, Output},
+    mlp::Normalizer,
     observation::HistoryMap,
-    policy::Normalizer,
 };
 use emp_robot::Robot;
 use rand::{SeedableRng as _, rngs::StdRng};

@@ -6,7 +6,8 @@ use anyhow::Context as _;
 use candle_core::{Device, Tensor};
 use emp_models::{
     checkpoint::Tensors,
-    policy::{Normalizer, Policy, PolicyConfig},
+    mlp::Normalizer,
+    policy::{Policy, PolicyConfig},
 };
 use emp_robot::Robot;
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};

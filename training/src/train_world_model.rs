@@ -141,6 +141,7 @@ fn equipment(
         procedural: settings.procedural_clips,
         seed: settings.seed,
         live: settings.live,
+        frames: settings.episodes.episode_frames,
     };
     let (clips, data) = data::clips(&retargeter, &motions, arguments.threads)?;
     eprintln!("{} clips", clips.len());

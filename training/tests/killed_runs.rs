@@ -93,9 +93,9 @@ fn a_policy_resumes_bit_for_bit_at_any_number_of_threads() {
 }
 
 /// A small EMP run; an evaluation would write weights before it is killed.
-const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_up=8 --set hindsight.frames=4 \
-                   --set procedural_clips=2 --set evaluation_clips=1 --set optimizer.rows=64 \
-                   --set evaluate_every=1000000";
+const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_up=8 --set procedural_clips=2 \
+                   --set hindsight.horizon=4 --set hindsight.window=2 --set optimizer.rows=64 \
+                   --set evaluation_clips=1 --set evaluate_every=1000000";
 
 #[test]
 fn an_emp_that_learns_the_price_of_falls_resumes_bit_for_bit() {

@@ -27,8 +27,8 @@ pub use packed::PackedNetwork;
 use crate::{
     CheckpointMetadata, ModelError,
     checkpoint::{self, Tensors},
+    mlp::{Normalizer, shipped_tensors},
     observation::{HISTORY, HistoryMap, ObservationLayout},
-    policy::Normalizer,
 };
 
 /// The kind that an EMP's checkpoint names.
@@ -211,11 +211,7 @@ impl Emp {
         metadata.config = serde_json::to_value(config).map_err(candle_core::Error::wrap)?;
         metadata.training = training;
         metadata.git_revision = git_revision;
-        let mut tensors: Tensors = normalizer.tensors()?.into_iter().collect();
-        for (name, tensor) in network {
-            let name = format!("{NETWORK_PREFIX}.{name}");
-            tensors.insert(name, tensor.to_dtype(DType::F16)?);
-        }
+        let tensors = shipped_tensors(NETWORK_PREFIX, normalizer, network)?;
         checkpoint::save(path, metadata, &tensors)
     }
 

@@ -6,7 +6,7 @@ use candle_nn::VarBuilder;
 use super::{EmpConfig, Output, PackedNetwork};
 use crate::{
     checkpoint::Tensors,
-    policy::{Mlp, Normalizer},
+    mlp::{Mlp, Normalizer},
 };
 
 /// Names of the networks, in the order of [`EmpNetwork`]'s fields.

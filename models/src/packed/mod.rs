@@ -1,6 +1,6 @@
 //! Inference of MLPs whose weights are packed once, at load: for batches of 1 to 64 rows on a CPU.
 //!
-//! [`Mlp`](crate::policy::Mlp) is what training differentiates; its matrix products rearrange the weights at every call, which
+//! [`Mlp`](crate::mlp::Mlp) is what training differentiates; its matrix products rearrange the weights at every call, which
 //! costs most where there are few rows. Here the weights of 32 outputs lie together in a panel, in the order in which they
 //! are read; bias and ELU are applied before a tile of answers leaves the registers.
 //!

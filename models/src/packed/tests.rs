@@ -6,7 +6,7 @@ use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
-use crate::policy::Mlp;
+use crate::mlp::Mlp;
 
 /// Weights and biases of layers.
 type Layers = Vec<(Vec<f32>, Vec<f32>)>;

@@ -10,7 +10,6 @@ use rayon::prelude::*;
 
 use super::TrackingSettings;
 use super::episode::{EndedEpisode, Environment, Setting, Slots};
-use crate::environment::PrivilegedLayout;
 use crate::goals::{GoalClip, check_clips};
 use crate::{End, Pool, SimError};
 
@@ -23,7 +22,7 @@ const GROUP: usize = 16;
 pub struct TrackingEnvironments {
     pool: Arc<Pool>,
     policy: Arc<Policy>,
-    setting: Setting,
+    setting: Arc<Setting>,
     environments: Vec<Environment>,
     batch: Batch,
 }
@@ -38,8 +37,6 @@ pub struct TrackingStep<'a> {
     pub actions: &'a [f32],
     /// `[q | roll, pitch, yaw]` of `s_{t+1}`, N × (joints + 3), rad; yaw relative to the heading at reset.
     pub next: &'a [f32],
-    /// Horizontal part of the projected gravity, N × 2.
-    pub gravity: &'a [f32],
     /// Horizontal way from the middle between the feet to the measured centre of mass, heading frame (x forward, y left),
     /// N × 2, metres.
     pub com: &'a [f32],
@@ -47,25 +44,24 @@ pub struct TrackingStep<'a> {
     pub contact: &'a [f32],
     /// How the control period ended, N. Where it ended an episode, the observations are already those of the next one.
     pub ends: &'a [End],
-    /// Where an episode ended: the privileged observation at its end, N × [`PrivilegedLayout::width`].
-    pub final_privileged: &'a [f32],
     /// The episodes that ended, in the order of the rows.
     pub episodes: &'a [EndedEpisode],
 }
+
+/// A robot in the middle of an episode.
+#[derive(Clone, Debug)]
+pub struct TrackingState(Environment);
 
 #[derive(Debug)]
 struct Batch {
     observations: Vec<f32>,
     goals: Vec<f32>,
-    privileged: Vec<f32>,
     starts: Vec<bool>,
     actions: Vec<f32>,
     next: Vec<f32>,
-    gravity: Vec<f32>,
     com: Vec<f32>,
     contact: Vec<f32>,
     ends: Vec<End>,
-    final_privileged: Vec<f32>,
     ended: Vec<Option<EndedEpisode>>,
     episodes: Vec<EndedEpisode>,
 }
@@ -87,7 +83,7 @@ impl TrackingEnvironments {
     ) -> Result<Self, SimError> {
         settings.check(&robot)?;
         check_clips(&robot, &clips)?;
-        let setting = Setting::new(robot, settings, clips)?;
+        let setting = Arc::new(Setting::new(robot, settings, clips)?);
         if policy.layout() != &setting.kind.observation {
             return Err(SimError::Setting {
                 name: "policy".to_owned(),
@@ -132,11 +128,6 @@ impl TrackingEnvironments {
         &self.setting.kind.observation
     }
 
-    /// Where each part of a privileged observation stands.
-    pub fn privileged_layout(&self) -> &PrivilegedLayout {
-        &self.setting.kind.privileged
-    }
-
     /// The stacks `S_t`, N × [`ObservationLayout::width`]; the newest goal is the one that is asked for, those before it are the
     /// executed ones.
     pub fn observations(&self) -> &[f32] {
@@ -146,11 +137,6 @@ impl TrackingEnvironments {
     /// The goals that are asked for, N × goal joints, rad.
     pub fn goals(&self) -> &[f32] {
         &self.batch.goals
-    }
-
-    /// What only a simulation knows, N × [`PrivilegedLayout::width`].
-    pub fn privileged(&self) -> &[f32] {
-        &self.batch.privileged
     }
 
     /// Whether this is the first control period of an episode, N.
@@ -189,11 +175,9 @@ impl TrackingEnvironments {
         Ok(TrackingStep {
             actions: &batch.actions,
             next: &batch.next,
-            gravity: &batch.gravity,
             com: &batch.com,
             contact: &batch.contact,
             ends: &batch.ends,
-            final_privileged: &batch.final_privileged,
             episodes: &batch.episodes,
         })
     }
@@ -220,7 +204,6 @@ impl TrackingEnvironments {
     fn simulate(&mut self, executed: &[f32]) {
         let (setting, batch) = (&self.setting, &mut self.batch);
         let layout = &setting.kind.observation;
-        let privileged = setting.kind.privileged.width();
         let commands = executed
             .par_chunks_exact(layout.goal().len())
             .zip(batch.actions.par_chunks_exact(layout.last_action().len()));
@@ -228,11 +211,8 @@ impl TrackingEnvironments {
             self.environments.par_iter_mut(),
             commands,
             batch.observations.par_chunks_exact_mut(layout.width()),
-            batch.privileged.par_chunks_exact_mut(privileged),
-            batch.final_privileged.par_chunks_exact_mut(privileged),
             batch.starts.par_iter_mut(),
             batch.next.par_chunks_exact_mut(next_width(layout)),
-            batch.gravity.par_chunks_exact_mut(2),
             batch.com.par_chunks_exact_mut(2),
             batch.contact.par_iter_mut(),
             batch.ends.par_iter_mut(),
@@ -243,11 +223,8 @@ impl TrackingEnvironments {
                 environment,
                 (executed, action),
                 observation,
-                privileged,
-                final_privileged,
                 start,
                 next,
-                gravity,
                 com,
                 contact,
                 end,
@@ -255,11 +232,8 @@ impl TrackingEnvironments {
             ) = row;
             let mut slots = Slots {
                 observation,
-                privileged,
-                final_privileged,
                 start,
                 next,
-                gravity,
                 com,
                 contact,
                 end,
@@ -267,6 +241,30 @@ impl TrackingEnvironments {
             };
             environment.step(setting, stage, [executed, action], &mut slots);
         });
+    }
+
+    /// The environments as they are now, row by row.
+    pub fn states(&self) -> Vec<TrackingState> {
+        let environments = self.environments.iter().cloned();
+        environments.map(TrackingState).collect()
+    }
+
+    /// Environments that go on from `states` of these ones, one a row: with the same executed goals what follows is the same
+    /// (but for the policy's last bits, which depend on the batch).
+    pub fn fork<'a>(&self, states: impl Iterator<Item = &'a TrackingState>) -> Self {
+        let environments: Vec<_> = states
+            .enumerate()
+            .map(|(row, state)| state.0.clone().in_row(row))
+            .collect();
+        let mut fork = Self {
+            pool: Arc::clone(&self.pool),
+            policy: Arc::clone(&self.policy),
+            batch: Batch::new(&self.setting, environments.len()),
+            setting: Arc::clone(&self.setting),
+            environments,
+        };
+        fork.observe();
+        fork
     }
 
     /// Everything that the environments' future depends on, but for the executed goals, the clips, the policy and the settings.
@@ -307,18 +305,10 @@ impl TrackingEnvironments {
     fn observe(&mut self) {
         let (setting, batch) = (&self.setting, &mut self.batch);
         let layout = &setting.kind.observation;
-        let rows = batch
-            .observations
-            .chunks_exact_mut(layout.width())
-            .zip(
-                batch
-                    .privileged
-                    .chunks_exact_mut(setting.kind.privileged.width()),
-            )
-            .zip(&mut batch.starts);
-        for (environment, ((observation, privileged), start)) in self.environments.iter().zip(rows)
-        {
-            environment.write(setting, observation, privileged, start);
+        let stacks = batch.observations.chunks_exact_mut(layout.width());
+        let rows = stacks.zip(&mut batch.starts);
+        for (environment, (observation, start)) in self.environments.iter().zip(rows) {
+            environment.write(observation, start);
         }
         batch.set_goals(layout);
     }
@@ -328,19 +318,15 @@ impl Batch {
     fn new(setting: &Setting, count: usize) -> Self {
         let layout = &setting.kind.observation;
         let rows = |width: usize| vec![0.0; count * width];
-        let privileged = setting.kind.privileged.width();
         Self {
             observations: rows(layout.width()),
             goals: rows(layout.goal().len()),
-            privileged: rows(privileged),
             starts: vec![true; count],
             actions: rows(layout.last_action().len()),
             next: rows(next_width(layout)),
-            gravity: rows(2),
             com: rows(2),
             contact: rows(1),
             ends: vec![End::None; count],
-            final_privileged: rows(privileged),
             ended: vec![None; count],
             episodes: Vec::new(),
         }

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use emp_models::observation::projected_gravity;
 use emp_robot::Robot;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -72,11 +71,8 @@ pub struct EndedEpisode {
 #[derive(Debug)]
 pub(super) struct Slots<'a> {
     pub(super) observation: &'a mut [f32],
-    pub(super) privileged: &'a mut [f32],
-    pub(super) final_privileged: &'a mut [f32],
     pub(super) start: &'a mut bool,
     pub(super) next: &'a mut [f32],
-    pub(super) gravity: &'a mut [f32],
     pub(super) com: &'a mut [f32],
     pub(super) contact: &'a mut f32,
     pub(super) end: &'a mut End,
@@ -125,6 +121,12 @@ impl Environment {
         environment.reset(setting, stage);
         environment.length = ((share * environment.length as f64) as usize).max(1);
         environment
+    }
+
+    /// The same in another row of a batch.
+    pub(super) fn in_row(mut self, row: usize) -> Self {
+        self.row = row;
+        self
     }
 
     /// Starts a new episode.
@@ -185,10 +187,9 @@ impl Environment {
             end,
         });
         if end.is_some() {
-            self.subject.write_privileged(kind, slots.final_privileged);
             self.reset(setting, stage);
         }
-        self.write(setting, slots.observation, slots.privileged, slots.start);
+        self.write(slots.observation, slots.start);
     }
 
     /// Writes what became of the control period.
@@ -198,23 +199,14 @@ impl Environment {
         let (joints, orientation) = slots.next.split_at_mut(layout.joint_positions().len());
         joints.copy_from_slice(&newest[layout.joint_positions()]);
         orientation.copy_from_slice(&newest[layout.orientation()]);
-        let [x, y, _] = projected_gravity(&reading.orientation);
-        slots.gravity.copy_from_slice(&[x as f32, y as f32]);
         let com = reading.center_of_mass_over_feet();
         slots.com.copy_from_slice(&[com.x as f32, com.y as f32]);
         *slots.contact = reading.self_contact.force.norm() as f32;
     }
 
     /// Writes what the learner sees now.
-    pub(super) fn write(
-        &self,
-        setting: &Setting,
-        observation: &mut [f32],
-        privileged: &mut [f32],
-        start: &mut bool,
-    ) {
+    pub(super) fn write(&self, observation: &mut [f32], start: &mut bool) {
         observation.copy_from_slice(self.subject.history.stack());
-        self.subject.write_privileged(&setting.kind, privileged);
         *start = self.age == 0;
     }
 

@@ -11,6 +11,6 @@ mod settings;
 #[cfg(test)]
 mod tests;
 
-pub use environments::{TrackingEnvironments, TrackingStep};
+pub use environments::{TrackingEnvironments, TrackingState, TrackingStep};
 pub use episode::EndedEpisode;
 pub use settings::TrackingSettings;

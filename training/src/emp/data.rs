@@ -11,9 +11,6 @@ use serde_json::json;
 
 use crate::retargeter::data;
 
-/// Frames of a clip, as in the paper.
-pub const FRAMES: usize = 200;
-
 /// What the clips are made from.
 pub struct Motions<'a> {
     /// Folders or files of recorded motion.
@@ -24,9 +21,11 @@ pub struct Motions<'a> {
     pub seed: u64,
     /// Share of motions that come from the network alone.
     pub live: f64,
+    /// Frames of a clip.
+    pub frames: usize,
 }
 
-/// Clips of 200 frames, with a summary for a checkpoint's metadata.
+/// Clips, with a summary for a checkpoint's metadata.
 ///
 /// # Errors
 /// When a folder holds no motion, a file is broken, or the network fails.
@@ -53,7 +52,7 @@ pub fn clips(
         "live": motions.live,
         "retargeter": retargeter.metadata().version(),
     });
-    let windows = clips.iter().flat_map(|clip| clip.windows(FRAMES));
+    let windows = clips.iter().flat_map(|clip| clip.windows(motions.frames));
     Ok((windows.collect(), summary))
 }
 

@@ -116,8 +116,9 @@ mod tests {
     use emp_models::{
         CheckpointMetadata,
         emp::{DangerGate, EmpConfig, Output},
+        mlp::{Mlp, Normalizer},
         observation::{HISTORY, HistoryMap, ObservationLayout},
-        policy::{self, Mlp, Normalizer, PolicyConfig},
+        policy::{self, PolicyConfig},
         world_model::{Scaling, WorldModelConfig},
     };
     use emp_robot::Robot;

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{
     imagination::Imagination,
     learner::usable_rows,
-    rollout::{Cost, Exploration, Explorer, Rollout},
+    rollout::{Collector, Rollout},
     settings::Settings,
     trainer::{Equipment, environments},
 };
@@ -28,7 +28,7 @@ const PREFIX: &str = "world-model";
 /// A world model that learns beside the EMP.
 pub struct Imaginer {
     settings: Settings,
-    explorer: Explorer,
+    collector: Collector,
     learner: WorldModelLearner,
     /// Rollouts learnt from.
     rollouts: u64,
@@ -41,14 +41,14 @@ impl Imaginer {
     /// When a setting is out of bounds, or the simulation fails.
     pub fn new(equipment: &Equipment, settings: &Settings) -> Result<Self> {
         let seed = settings.seed ^ SEED;
-        let mut explorer = Explorer::new(environments(equipment, settings, seed)?, seed);
-        let rollout = collect(&mut explorer, settings, equipment)?;
-        let sample = sequences(&explorer, &rollout, &usable_rows(&rollout, 1), 1);
+        let mut collector = Collector::new(environments(equipment, settings, seed)?);
+        let rollout = collect(&mut collector, settings, equipment)?;
+        let sample = sequences(&collector, &rollout, &usable_rows(&rollout, 1), 1);
         let learner = settings.world_model.learner.clone();
         Ok(Self {
             learner: WorldModelLearner::new(&equipment.robot, learner, &sample, seed)?,
             settings: settings.clone(),
-            explorer,
+            collector,
             rollouts: 0,
         })
     }
@@ -58,7 +58,7 @@ impl Imaginer {
     /// # Errors
     /// When the simulation fails, or a gradient is not a number.
     pub fn learn(&mut self, equipment: &Equipment) -> Result<f64> {
-        let rollout = collect(&mut self.explorer, &self.settings, equipment)?;
+        let rollout = collect(&mut self.collector, &self.settings, equipment)?;
         let steps = self.settings.wm_loss_steps;
         let usable = usable_rows(&rollout, steps);
         let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed ^ SEED);
@@ -73,7 +73,7 @@ impl Imaginer {
             }
             let left = order.len().saturating_sub(world_model.rows);
             let rows: Vec<usize> = order.split_off(left);
-            let batch = sequences(&self.explorer, &rollout, &rows, steps);
+            let batch = sequences(&self.collector, &rollout, &rows, steps);
             let rate = world_model.learning_rate;
             losses += self.learner.update(&batch, rate, &equipment.threads)?.loss;
         }
@@ -98,7 +98,7 @@ impl Imaginer {
         let state = self.learner.state()?.into_iter();
         tensors.extend(state.map(|(name, tensor)| (format!("{PREFIX}/{name}"), tensor)));
         Ok((
-            self.explorer.snapshot()?,
+            self.collector.snapshot()?,
             [self.rollouts, self.learner.steps()],
         ))
     }
@@ -120,22 +120,21 @@ impl Imaginer {
         self.learner
             .restore(&own.collect(), steps)
             .context("the world model")?;
-        self.explorer.restore(snapshot)?;
+        self.collector.restore(snapshot)?;
         self.rollouts = rollouts;
         Ok(())
     }
 }
 
-fn collect(explorer: &mut Explorer, settings: &Settings, equipment: &Equipment) -> Result<Rollout> {
-    let cost = Cost {
-        settings: &settings.risk,
-        reference: [0.0; 2],
-    };
-    let (unexplored, threads) = (Exploration::default(), &equipment.threads);
-    explorer.collect(None, unexplored, settings.frames, &cost, threads)
+fn collect(
+    collector: &mut Collector,
+    settings: &Settings,
+    equipment: &Equipment,
+) -> Result<Rollout> {
+    collector.collect(None, settings.frames, 0, &equipment.threads)
 }
 
-fn sequences(explorer: &Explorer, rollout: &Rollout, rows: &[usize], steps: usize) -> Sequences {
+fn sequences(collector: &Collector, rollout: &Rollout, rows: &[usize], steps: usize) -> Sequences {
     let trajectories = Trajectories {
         environments: rollout.environments,
         stacks: &rollout.stacks,
@@ -143,5 +142,10 @@ fn sequences(explorer: &Explorer, rollout: &Rollout, rows: &[usize], steps: usiz
         actions: &rollout.actions,
         next: &rollout.next,
     };
-    Sequences::gather(&trajectories, explorer.environments().layout(), rows, steps)
+    Sequences::gather(
+        &trajectories,
+        collector.environments().layout(),
+        rows,
+        steps,
+    )
 }

@@ -18,7 +18,8 @@ use emp_sim::{
 };
 use serde::Serialize;
 
-use super::data::FRAMES;
+/// Frames of a clip, as in the paper.
+const FRAMES: usize = 200;
 
 /// Seed of the clips. Training clips are made from other seeds.
 const SEED: u64 = 0x656d_705f_6865_6c64;

@@ -1,9 +1,8 @@
 //! The learner of an EMP: from one rollout to the next weights.
 //!
 //! The loss is the paper's weighted sum of six, through imagined control periods where the settings ask for them, plus the
-//! lesson of falls (see [`HindsightSettings`](super::settings::HindsightSettings)) and the price of contacts and falls (see
-//! [`RiskSettings`](super::settings::RiskSettings)). Each mini-batch is cut into a fixed number of shards whose
-//! gradients are added in order, so the weights have the same bits at any number of threads.
+//! lesson of falls and contacts (see [`Hindsight`](super::hindsight::Hindsight)). Each mini-batch is cut into a fixed number of
+//! shards whose gradients are added in order, so the weights have the same bits at any number of threads.
 
 use std::{sync::Arc, time::Instant};
 
@@ -13,9 +12,9 @@ use candle_nn::{VarBuilder, VarMap};
 use emp_models::{
     checkpoint::Tensors,
     emp::{EmpConfig, EmpNetwork, Output},
+    mlp::Normalizer,
     observation::ObservationLayout,
     optimizer::{Adam, AdamConfig},
-    policy::{Mlp, Normalizer},
 };
 use emp_robot::Robot;
 use emp_sim::End;
@@ -25,32 +24,25 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
+    hindsight::{Label, Labels},
     imagination::{Imagination, ImaginedStep},
+    memory::Memory,
     objective::{Moments, Objective},
     rollout::Rollout,
     settings::Settings,
 };
 use crate::{
-    policy::{
-        moments::RunningMoments,
-        objective::{self as ppo, adapted_learning_rate},
-        returns::{self, Trajectories},
-    },
+    policy::moments::RunningMoments,
     rows::{add_gradients, gather, gathered, tensor},
     variables,
 };
-
-/// Rows of a forward pass without gradient.
-const ROWS: usize = 1024;
 
 /// A residual EMP starts this near to leaving goals as they are.
 const RESIDUAL_GAIN: f64 = 0.01;
 
 /// Names in a checkpoint.
 const EMP: &str = "emp";
-const CRITIC: &str = "critic";
 const AVERAGE: &str = "average";
-const PRIVILEGED: &str = "moments.privileged";
 const NORMALIZER: &str = "emp-normalizer";
 
 /// Learns an EMP from rollouts.
@@ -63,13 +55,8 @@ pub struct Learner {
     adam: Adam,
     /// Running mean of the EMP's weights.
     average: Tensors,
-    critic: Critic,
+    memory: Memory,
     objective: Objective,
-    /// Angles of the goal joints in the default pose, rad.
-    default_pose: Vec<f32>,
-    /// 1 for the goal joints of which hindsight speaks, else 0.
-    lesson_joints: Vec<f32>,
-    reference: [f64; 2],
     progress: Progress,
 }
 
@@ -80,10 +67,6 @@ pub struct Progress {
     pub updates: u64,
     /// Steps of the EMP's optimiser.
     pub optimizer_steps: u64,
-    /// Steps of the critic's.
-    pub critic_steps: u64,
-    /// Step size of the EMP.
-    pub learning_rate: f64,
     /// The policy's operating point as it is measured, m.
     pub measured_reference: [f64; 2],
     /// The same as the centroid loss sees it, m.
@@ -97,26 +80,10 @@ pub struct UpdateStatistics {
     pub terms: [f64; 6],
     /// Mean weighted loss of hindsight.
     pub hindsight: f64,
-    /// Mean weighted surrogate of the risk.
-    pub risk: f64,
-    /// Share of the returns' variance that the critic explains.
-    pub explained_variance: f64,
-    /// Mean divergence of the EMP from the one that explored.
-    pub divergence: f64,
     /// Mean norm of the EMP's gradient before it was bounded.
     pub gradient_norm: f64,
-    /// Step size after the update.
-    pub learning_rate: f64,
     /// Seconds that it took.
     pub seconds: f64,
-}
-
-/// The value of a state, from what only a simulation knows.
-struct Critic {
-    network: Mlp,
-    vars: VarMap,
-    adam: Adam,
-    moments: RunningMoments,
 }
 
 impl Learner {
@@ -151,40 +118,26 @@ impl Learner {
                 ..AdamConfig::default()
             },
         )?;
-        let mut critic = Critic::new(warm_up.privileged_width, settings, &mut rng)?;
-        critic.moments.update(&warm_up.privileged);
         Ok(Self {
             progress: Progress {
                 updates: 0,
                 optimizer_steps: 0,
-                critic_steps: 0,
-                learning_rate: settings.optimizer.learning_rate[1],
                 measured_reference: warm_up.reference,
                 loss_reference,
             },
             settings: settings.clone(),
             layout,
             average: variables::values(&vars)?,
+            memory: Memory::new(
+                settings.hindsight.memory,
+                network.config().features(),
+                layout.goal().len(),
+            ),
             network,
             normalizer,
             vars,
             adam,
-            critic,
             objective,
-            default_pose: robot
-                .goal_joints()
-                .iter()
-                .map(|joint| joint.default as f32)
-                .collect(),
-            lesson_joints: robot
-                .goal_joints()
-                .iter()
-                .map(|joint| {
-                    let mut words = settings.hindsight.joints.iter();
-                    f32::from(u8::from(words.any(|word| joint.name.contains(word))))
-                })
-                .collect(),
-            reference: warm_up.reference,
         })
     }
 
@@ -210,7 +163,7 @@ impl Learner {
 
     /// The policy's operating point as it is measured: offset of the centre of mass from the middle of the feet, m.
     pub fn reference(&self) -> [f64; 2] {
-        self.reference
+        self.progress.measured_reference
     }
 
     /// Weights, moments and the optimisers' state, for a checkpoint.
@@ -219,20 +172,17 @@ impl Learner {
     /// When a tensor cannot be made.
     pub fn state(&self) -> Result<Tensors> {
         let mut tensors = Tensors::new();
-        for (prefix, vars, adam) in [
-            (EMP, &self.vars, &self.adam),
-            (CRITIC, &self.critic.vars, &self.critic.adam),
-        ] {
-            let parts = variables::values(vars)?.into_iter().chain(adam.state()?);
-            tensors.extend(parts.map(|(name, tensor)| (format!("{prefix}/{name}"), tensor)));
-        }
+        let parts = variables::values(&self.vars)?
+            .into_iter()
+            .chain(self.adam.state()?);
+        tensors.extend(parts.map(|(name, tensor)| (format!("{EMP}/{name}"), tensor)));
         for (name, tensor) in self.normalizer.tensors()? {
             tensors.insert(format!("{NORMALIZER}/{name}"), tensor);
         }
         for (name, tensor) in &self.average {
             tensors.insert(format!("{AVERAGE}/{name}"), tensor.clone());
         }
-        self.critic.moments.save(PRIVILEGED, &mut tensors)?;
+        self.memory.save(&mut tensors)?;
         Ok(tensors)
     }
 
@@ -251,34 +201,41 @@ impl Learner {
         let emp = part(EMP);
         variables::restore(&self.vars, &emp)?;
         self.adam.restore(&emp, progress.optimizer_steps)?;
-        let critic = part(CRITIC);
-        variables::restore(&self.critic.vars, &critic)?;
-        self.critic.adam.restore(&critic, progress.critic_steps)?;
-        self.critic.moments.restore(PRIVILEGED, tensors)?;
+        self.memory.restore(tensors)?;
         self.average = part(AVERAGE);
         let config = self.network.config().clone();
         self.normalizer = Normalizer::from_tensors(&part(NORMALIZER), config.features())
             .map_err(anyhow::Error::msg)?;
         let builder = VarBuilder::from_varmap(&self.vars, DType::F32, &Device::Cpu);
         self.network = EmpNetwork::new(config, self.normalizer.clone(), &builder)?;
-        self.reference = progress.measured_reference;
         self.objective.set_reference(progress.loss_reference);
         self.progress = progress;
         Ok(())
     }
 
-    /// Learns from a rollout; `imagination` is what the settings' horizon needs, if it is not 0.
+    /// Learns from a rollout; `labels` are what hindsight says of it, `imagination` what the settings' horizon needs, if it is
+    /// not 0.
     ///
     /// # Errors
     /// When a gradient is not a number.
     pub fn update(
         &mut self,
         rollout: &Rollout,
+        labels: Option<&Labels>,
         imagination: Option<&Imagination>,
         threads: &rayon::ThreadPool,
     ) -> Result<UpdateStatistics> {
         let start = Instant::now();
-        let batch = self.batch(rollout, threads)?;
+        if let Some(labels) = labels {
+            self.memory
+                .add(rollout, labels, &self.network, &self.layout);
+        }
+        let usable = usable_rows(rollout, self.settings.horizon);
+        let source = Source {
+            rollout,
+            labels,
+            imagination,
+        };
         let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
         // Stream 0 drew the weights.
         rng.set_stream(self.progress.updates + 1);
@@ -287,21 +244,21 @@ impl Learner {
         let optimizer = self.settings.optimizer.clone();
         for update in 0..optimizer.updates {
             if order.is_empty() {
-                order.clone_from(&batch.usable);
+                order.clone_from(&usable);
                 order.shuffle(&mut rng);
             }
             let left = order.len().saturating_sub(optimizer.rows);
-            let rows = order.split_off(left);
-            self.step(rollout, &batch, &rows, imagination, threads, &mut sums)
+            let rows = MiniBatch {
+                rows: order.split_off(left),
+                lessons: self.memory.draw(self.settings.hindsight.rows, &mut rng),
+            };
+            self.step(&source, &rows, threads, &mut sums)
                 .with_context(|| format!("rollout {}, update {update}", self.progress.updates))?;
         }
         self.follow()?;
-        let newest = rollout.privileged.len() - self.critic.moments.width() * rollout.environments;
-        self.critic.moments.update(&rollout.privileged[newest..]);
         self.progress.updates += 1;
         self.progress.optimizer_steps = self.adam.steps();
-        self.progress.critic_steps = self.critic.adam.steps();
-        Ok(sums.statistics(&batch, self.progress.learning_rate, start))
+        Ok(sums.statistics(start))
     }
 
     /// Lets the running mean of the weights follow them.
@@ -315,167 +272,79 @@ impl Learner {
         Ok(())
     }
 
-    /// Works out what is to be learnt from a rollout.
-    fn batch(&self, rollout: &Rollout, threads: &rayon::ThreadPool) -> Result<Batch> {
-        let mut usable = usable_rows(rollout, self.settings.horizon);
-        let hindsight = &self.settings.hindsight;
-        let mut lessons = vec![false; rollout.rows()];
-        if hindsight.weight > 0.0 {
-            let foreseen = rollout.foreseen(hindsight.frames);
-            usable.retain(|row| foreseen[*row]);
-            let before_fall =
-                |periods: Option<usize>| periods.is_some_and(|n| n < hindsight.frames);
-            lessons = rollout.until_fall().into_iter().map(before_fall).collect();
-        }
-        let risk = &self.settings.risk;
-        if risk.weight == 0.0 {
-            return Ok(Batch {
-                usable,
-                lessons,
-                ..Batch::default()
-            });
-        }
-        let normalizer = self.critic.moments.normalizer();
-        let normalized = |rows: &[f32]| {
-            let mut rows = rows.to_vec();
-            normalizer.apply(&mut rows);
-            rows
-        };
-        let privileged = normalized(&rollout.privileged);
-        let values = self.critic.values(&privileged, threads)?;
-        let mut rewards: Vec<f32> = rollout.costs.iter().map(|cost| -cost).collect();
-        for (row, privileged) in &rollout.timed_out_privileged {
-            // The episode would have gone on: what it would have cost counts.
-            let value = self.critic.values(&normalized(privileged), threads)?[0];
-            rewards[*row] += risk.discount as f32 * value;
-        }
-        let ended: Vec<bool> = rollout.ends.iter().map(|end| *end != End::None).collect();
-        let trajectories = Trajectories {
-            environments: rollout.environments,
-            rewards: &rewards,
-            values: &values,
-            last_values: &self
-                .critic
-                .values(&normalized(&rollout.last_privileged), threads)?,
-            ended: &ended,
-        };
-        let advantages = returns::advantages(&trajectories, risk.discount, risk.trace_decay);
-        let returns: Vec<f32> = advantages.iter().zip(&values).map(|(a, v)| a + v).collect();
-        let joints = self.layout.goal().len();
-        let (samples, means) = (&rollout.samples, &rollout.means);
-        Ok(Batch {
-            usable,
-            lessons,
-            log_probabilities: ppo::log_probabilities(
-                &tensor(samples, joints)?,
-                &tensor(means, joints)?,
-                &self.log_std()?,
-            )?
-            .to_vec1()?,
-            explained_variance: returns::explained_variance(&returns, &advantages),
-            advantages,
-            returns,
-            privileged,
-        })
-    }
-
-    fn log_std(&self) -> candle_core::Result<Tensor> {
-        let log_std = vec![self.settings.risk.std.ln() as f32; self.layout.goal().len()];
-        Tensor::new(log_std, &Device::Cpu)
-    }
-
-    /// One step of the optimisers on the given rows.
+    /// One step of the optimiser on the given rows.
     fn step(
         &mut self,
-        rollout: &Rollout,
-        batch: &Batch,
-        rows: &[usize],
-        imagination: Option<&Imagination>,
+        source: &Source<'_>,
+        mini_batch: &MiniBatch,
         threads: &rayon::ThreadPool,
         sums: &mut Sums,
     ) -> Result<()> {
-        let shard_rows = rows.len().div_ceil(self.settings.optimizer.shards);
+        let count = self.settings.optimizer.shards;
         let shards = threads.install(|| {
-            let shards = rows.par_chunks(shard_rows);
-            shards
-                .map(|shard| self.shard(rollout, batch, shard, rows.len(), imagination))
-                .collect::<Result<Vec<_>>>()
+            let shards = (0..count).into_par_iter().map(|shard| {
+                let part = mini_batch.part(shard, count);
+                self.shard(source, &part, mini_batch)
+            });
+            shards.collect::<Result<Vec<_>>>()
         })?;
-        let risk = &self.settings.risk;
-        let divergence = shards.iter().map(|shard| shard.divergence).sum::<f64>();
-        let divergence = divergence / rows.len() as f64;
-        if risk.weight > 0.0 {
-            let rate = &mut self.progress.learning_rate;
-            *rate = adapted_learning_rate(
-                *rate,
-                divergence,
-                risk.target_divergence,
-                self.settings.optimizer.learning_rate,
-            );
-        }
-        sums.add(&shards, divergence);
+        sums.add(&shards);
         let gradients = shards.into_iter().map(|shard| shard.gradient);
-        let gradient = add_gradients(gradients, &[&self.vars, &self.critic.vars])?;
-        sums.gradient_norm += self.adam.step(&gradient, self.progress.learning_rate)?;
-        if risk.weight > 0.0 {
-            self.critic
-                .adam
-                .step(&gradient, risk.critic_learning_rate)?;
-        }
+        let gradient = add_gradients(gradients, &[&self.vars])?;
+        let rate = self.settings.optimizer.learning_rate;
+        sums.gradient_norm += self.adam.step(&gradient, rate)?;
         Ok(())
     }
 
-    /// The gradient of one shard of a mini-batch of `total` rows.
-    fn shard(
-        &self,
-        rollout: &Rollout,
-        batch: &Batch,
-        rows: &[usize],
-        total: usize,
-        imagination: Option<&Imagination>,
-    ) -> Result<Shard> {
-        let share = rows.len() as f64 / total as f64;
+    /// The gradient of one shard, a part of a mini-batch.
+    fn shard(&self, source: &Source<'_>, part: &MiniBatch, whole: &MiniBatch) -> Result<Shard> {
+        let (rows, rollout) = (&part.rows, source.rollout);
+        let share = rows.len() as f64 / whole.rows.len() as f64;
         let stacks = gather(&rollout.stacks, self.layout.width(), rows);
         let moments = self.moments(rollout, rows)?;
-        let steps = match imagination {
+        let steps = match source.imagination {
             Some(imagination) => {
                 let stacks = tensor(&stacks, self.layout.width())?;
                 imagination.unroll(&self.network, &stacks, &moments.goals_ahead)?
             }
             None => vec![self.unimagined(&stacks)?],
         };
-        let terms = self.objective.terms(&moments, &steps)?;
+        let mut terms = self.objective.terms(&moments, &steps)?;
+        if let Some(labels) = source.labels {
+            let right = labelled(labels, rows, Label::Right)?.repeat(steps.len())?;
+            terms.reconstruction = (&terms.reconstruction * right)?;
+        }
         let mut loss = (terms.total(&self.settings.losses.weights)? * share)?;
-        let hindsight = self.hindsight(rollout, batch, rows, &steps[0].goal)?;
-        let lesson = f64::from(hindsight.to_scalar::<f32>()?) / total as f64;
-        loss = (loss + (hindsight / total as f64)?)?;
-        let (mut surrogate, mut divergence) = (0.0, 0.0);
-        if self.settings.risk.weight > 0.0 {
-            let risk = self.risk(rollout, batch, rows, &steps[0].goal)?;
-            surrogate = f64::from(risk.surrogate.to_scalar::<f32>()?) / total as f64;
-            divergence = risk.divergence;
-            loss = (loss + ((risk.surrogate + risk.value_error)? / total as f64)?)?;
+        let mut lesson = 0.0;
+        if let Some(labels) = source.labels {
+            let contacts = self.contacts(labels, rows, &steps[0].goal)?;
+            let contacts = (contacts / whole.rows.len() as f64)?;
+            lesson += f64::from(contacts.to_scalar::<f32>()?);
+            loss = (loss + contacts)?;
+        }
+        if !part.lessons.is_empty() {
+            let hindsight = (self.falls(&part.lessons)? / whole.lessons.len() as f64)?;
+            lesson += f64::from(hindsight.to_scalar::<f32>()?);
+            loss = (loss + hindsight)?;
         }
         Ok(Shard {
             gradient: loss.backward()?,
             terms: terms.means()?.map(|mean| mean * share),
             hindsight: lesson,
-            risk: surrogate,
-            divergence,
         })
     }
 
-    /// What the losses look at. The smoothness loss looks back at answers, not at what was explored around them.
+    /// What the losses look at. The smoothness loss looks back at answers, not at what was executed of them.
     fn moments(&self, rollout: &Rollout, rows: &[usize]) -> Result<Moments> {
         let layout = &self.layout;
         let joints = layout.goal().len();
         let mut stacks = gather(&rollout.stacks, layout.width(), rows);
         for (stack, &row) in stacks.chunks_exact_mut(layout.width()).zip(rows) {
             let newest = layout.newest_goal();
-            for (periods, means) in (1..).zip(rollout.means_before.iter().rev()) {
+            for (periods, answers) in (1..).zip(rollout.answers_before.iter().rev()) {
                 let start = newest.start - periods * layout.frame_width();
-                let mean = &means[row * joints..(row + 1) * joints];
-                stack[start..start + joints].copy_from_slice(mean);
+                let answer = &answers[row * joints..(row + 1) * joints];
+                stack[start..start + joints].copy_from_slice(answer);
             }
         }
         let ahead = (1..self.settings.horizon).map(|ahead| {
@@ -518,62 +387,29 @@ impl Learner {
         })
     }
 
-    /// The weighted loss of hindsight, summed over the rows: distance from the goals that should have been asked for.
-    fn hindsight(
+    /// The weighted lesson of falls, summed over remembered rows: distance from the goals that should have been executed. It
+    /// weighs as much as if such rows were as frequent as in rollouts.
+    fn falls(&self, rows: &[usize]) -> candle_core::Result<Tensor> {
+        let lessons = self.memory.lessons(rows)?;
+        let (answers, _) = self
+            .network
+            .forward_features(&lessons.features, &lessons.goals)?;
+        let errors = (answers - lessons.targets)?;
+        let errors = self.settings.losses.distance.of(&errors)?.sum_all()?;
+        errors * (self.settings.hindsight.weight * self.memory.share())
+    }
+
+    /// The weighted lesson of contacts, summed over rows of the rollout.
+    fn contacts(
         &self,
-        rollout: &Rollout,
-        batch: &Batch,
+        labels: &Labels,
         rows: &[usize],
         answers: &Tensor,
     ) -> candle_core::Result<Tensor> {
-        let settings = &self.settings.hindsight;
-        let joints = self.layout.goal().len();
-        let weight = |&row: &usize| {
-            if batch.lessons[row] {
-                settings.weight as f32
-            } else {
-                0.0
-            }
-        };
-        let weights: Vec<f32> = rows.iter().map(weight).collect();
-        let default = Tensor::new(self.default_pose.as_slice(), &Device::Cpu)?;
-        let distances = gathered(&rollout.goals, joints, rows)?.broadcast_sub(&default)?;
-        let wiser = (distances * settings.amplitude)?.broadcast_add(&default)?;
-        let joints = Tensor::new(self.lesson_joints.as_slice(), &Device::Cpu)?;
-        let errors = (answers - wiser)?.sqr()?.broadcast_mul(&joints)?.sum(1)?;
-        (errors * Tensor::from_vec(weights, rows.len(), &Device::Cpu)?)?.sum_all()
-    }
-
-    /// The surrogate of the expected cost, and the critic's error.
-    fn risk(
-        &self,
-        rollout: &Rollout,
-        batch: &Batch,
-        rows: &[usize],
-        means: &Tensor,
-    ) -> Result<Risk> {
-        let risk = &self.settings.risk;
-        let joints = self.layout.goal().len();
-        let column =
-            |values: &[f32]| Tensor::from_vec(gather(values, 1, rows), rows.len(), &Device::Cpu);
-        let log_std = self.log_std()?;
-        let samples = ppo::Samples {
-            actions: gathered(&rollout.samples, joints, rows)?,
-            log_probabilities: column(&batch.log_probabilities)?,
-            advantages: column(&batch.advantages)?,
-            returns: column(&batch.returns)?,
-        };
-        let privileged = gathered(&batch.privileged, self.critic.moments.width(), rows)?;
-        let values = self.critic.network.forward(&privileged)?.flatten_all()?;
-        let losses = ppo::Losses::new(&samples, means, &log_std, &values, risk.clip)?;
-        let old = gather(&rollout.means, joints, rows);
-        let new = means.flatten_all()?.to_vec1::<f32>()?;
-        let log_std = log_std.to_vec1::<f32>()?;
-        Ok(Risk {
-            divergence: ppo::divergence(&old, &new, &log_std, &log_std),
-            surrogate: (losses.policy * risk.weight)?,
-            value_error: losses.value,
-        })
+        let targets = gathered(&labels.targets, self.layout.goal().len(), rows)?;
+        let errors = self.settings.losses.distance.of(&(answers - targets)?)?;
+        let touches = labelled(labels, rows, Label::Touches)?;
+        (errors * touches)?.sum_all()? * self.settings.hindsight.contact_weight
     }
 }
 
@@ -583,8 +419,6 @@ pub struct WarmUp {
     stacks: Vec<f32>,
     /// Those of them that no fall follows in the rollout.
     safe_stacks: Tensor,
-    privileged: Vec<f32>,
-    privileged_width: usize,
     /// Where the centre of mass stands over the feet in safe frames, m.
     reference: [f64; 2],
 }
@@ -609,9 +443,7 @@ impl WarmUp {
         Ok(Self {
             reference: [mean(0), mean(1)],
             safe_stacks: gathered(&rollout.stacks, layout.width(), &safe)?,
-            privileged_width: rollout.last_privileged.len() / rollout.environments,
             stacks: rollout.stacks,
-            privileged: rollout.privileged,
         })
     }
 
@@ -626,57 +458,34 @@ impl WarmUp {
     }
 }
 
-impl Critic {
-    fn new(inputs: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> Result<Self> {
-        let vars = VarMap::new();
-        let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
-        let hidden = &settings.risk.critic_hidden;
-        let network = Mlp::new(inputs, hidden, 1, &builder)?;
-        variables::initialise(&vars, rng)?;
-        Ok(Self {
-            adam: Adam::new(&vars, AdamConfig::default())?,
-            moments: RunningMoments::new(inputs),
-            network,
-            vars,
-        })
-    }
+/// What is learnt from.
+struct Source<'a> {
+    rollout: &'a Rollout,
+    /// What hindsight says of the rows.
+    labels: Option<&'a Labels>,
+    imagination: Option<&'a Imagination>,
+}
 
-    /// Values of normalised privileged observations.
-    fn values(&self, privileged: &[f32], threads: &rayon::ThreadPool) -> Result<Vec<f32>> {
-        let width = self.moments.width();
-        let chunk = |rows: &[f32]| -> Result<Vec<f32>> {
-            let values = self.network.forward(&tensor(rows, width)?)?;
-            Ok(values.flatten_all()?.to_vec1()?)
+/// Rows of a step of the optimiser.
+struct MiniBatch {
+    /// Of the rollout.
+    rows: Vec<usize>,
+    /// Of the memory.
+    lessons: Vec<usize>,
+}
+
+impl MiniBatch {
+    /// One of `count` parts.
+    fn part(&self, part: usize, count: usize) -> Self {
+        let slice = |rows: &[usize]| {
+            let [start, end] = [part, part + 1].map(|part| part * rows.len() / count);
+            rows[start..end].to_vec()
         };
-        let chunks = threads.install(|| {
-            let chunks = privileged.par_chunks(ROWS * width).map(chunk);
-            chunks.collect::<Result<Vec<_>>>()
-        })?;
-        Ok(chunks.concat())
+        Self {
+            rows: slice(&self.rows),
+            lessons: slice(&self.lessons),
+        }
     }
-}
-
-/// What is to be learnt from a rollout; without risk only the rows.
-#[derive(Default)]
-struct Batch {
-    /// Rows from which the horizon can be imagined, and whose future is known as far as hindsight goes.
-    usable: Vec<usize>,
-    /// Whether a fall follows a row so soon that hindsight counts.
-    lessons: Vec<bool>,
-    log_probabilities: Vec<f32>,
-    advantages: Vec<f32>,
-    returns: Vec<f32>,
-    /// Normalised.
-    privileged: Vec<f32>,
-    explained_variance: f64,
-}
-
-struct Risk {
-    /// Summed over the rows, weighted.
-    surrogate: Tensor,
-    /// Summed over the rows.
-    value_error: Tensor,
-    divergence: f64,
 }
 
 /// What one shard of a mini-batch adds.
@@ -684,8 +493,6 @@ struct Shard {
     gradient: GradStore,
     terms: [f64; 6],
     hindsight: f64,
-    risk: f64,
-    divergence: f64,
 }
 
 /// Sums over an update's mini-batches.
@@ -694,33 +501,25 @@ struct Sums {
     batches: f64,
     terms: [f64; 6],
     hindsight: f64,
-    risk: f64,
-    divergence: f64,
     gradient_norm: f64,
 }
 
 impl Sums {
-    fn add(&mut self, shards: &[Shard], divergence: f64) {
+    fn add(&mut self, shards: &[Shard]) {
         self.batches += 1.0;
-        self.divergence += divergence;
         for shard in shards {
             self.hindsight += shard.hindsight;
-            self.risk += shard.risk;
             for (sum, term) in self.terms.iter_mut().zip(shard.terms) {
                 *sum += term;
             }
         }
     }
 
-    fn statistics(&self, batch: &Batch, learning_rate: f64, start: Instant) -> UpdateStatistics {
+    fn statistics(&self, start: Instant) -> UpdateStatistics {
         UpdateStatistics {
             terms: self.terms.map(|sum| sum / self.batches),
             hindsight: self.hindsight / self.batches,
-            risk: self.risk / self.batches,
-            explained_variance: batch.explained_variance,
-            divergence: self.divergence / self.batches,
             gradient_norm: self.gradient_norm / self.batches,
-            learning_rate,
             seconds: start.elapsed().as_secs_f64(),
         }
     }
@@ -737,6 +536,14 @@ fn shrink(vars: &VarMap, layer: &str) -> Result<()> {
         var.set(&(var.as_detached_tensor() * gain)?)?;
     }
     Ok(())
+}
+
+/// 1 for the rows with this label, else 0.
+fn labelled(labels: &Labels, rows: &[usize], label: Label) -> candle_core::Result<Tensor> {
+    let rows = rows
+        .iter()
+        .map(|&row| f32::from(u8::from(labels.labels[row] == label)));
+    Tensor::from_iter(rows, &Device::Cpu)
 }
 
 /// Rows that are followed by `horizon` − 1 more of the same episode within the rollout.

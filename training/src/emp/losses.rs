@@ -27,6 +27,9 @@ const ACCELERATION: f64 = 0.2;
 /// Under every square root, m²: a distance of zero has a gradient of zero.
 const EPSILON: f64 = 1e-12;
 
+/// Where a length stops being round at zero, rad.
+const ROUNDING: f64 = 0.05;
+
 /// The weights λ; the default is the paper's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -54,6 +57,31 @@ impl Default for LossWeights {
             centroid: 10.0,
             smoothness: 100.0,
             regularization: 1.0,
+        }
+    }
+}
+
+/// How far one goal is from another.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Distance {
+    /// ‖x‖², as printed. Between two wishes the best answer is their weighted mean.
+    #[default]
+    Square,
+    /// ‖x‖, rounded off below [`ROUNDING`]. Between two wishes the best answer is the weightier one.
+    Length,
+}
+
+impl Distance {
+    /// Of each row (N) of differences (N × joints, rad).
+    ///
+    /// # Errors
+    /// When the tensor library fails.
+    pub fn of(self, differences: &Tensor) -> candle_core::Result<Tensor> {
+        let squares = row_squares(differences)?;
+        match self {
+            Self::Square => Ok(squares),
+            Self::Length => (squares + ROUNDING * ROUNDING)?.sqrt()? - ROUNDING,
         }
     }
 }
@@ -97,6 +125,8 @@ pub enum CenRef {
 pub struct LossSettings {
     /// Weights of the terms.
     pub weights: LossWeights,
+    /// How far ĝ is from the goal that was asked for, and from what hindsight would have asked for.
+    pub distance: Distance,
     /// What has to be smooth.
     pub smooth_on: SmoothOn,
     /// The posture that the centroid and collision losses judge.
@@ -105,12 +135,16 @@ pub struct LossSettings {
     pub cen_ref: CenRef,
 }
 
-/// `L_rec = ‖g − ĝ‖²` (N) of goals as asked for and as executed (N × goal joints, rad).
+/// `L_rec = ‖g − ĝ‖²` (N), or another distance, of goals as asked for and as executed (N × goal joints, rad).
 ///
 /// # Errors
 /// When shapes do not fit.
-pub fn reconstruction(goals: &Tensor, executed: &Tensor) -> candle_core::Result<Tensor> {
-    row_squares(&(goals - executed)?)
+pub fn reconstruction(
+    goals: &Tensor,
+    executed: &Tensor,
+    distance: Distance,
+) -> candle_core::Result<Tensor> {
+    distance.of(&(goals - executed)?)
 }
 
 /// `L_ori = 1 − exp(−‖pg_xy‖²)` (N; erratum E3) of roll, pitch and yaw (N × 3, rad), from which the projected gravity
@@ -270,13 +304,22 @@ mod tests {
     }
 
     #[test]
-    fn reconstruction_is_the_squared_distance() {
+    fn reconstruction_is_the_squared_distance_or_the_distance() {
         let (goals, executed) = (
-            rows(&[[0.0, 1.0], [0.2, -0.1]]),
-            rows(&[[3.0, 5.0], [0.2, -0.1]]),
+            rows(&[[0.0, 1.0], [0.2, -0.1], [0.0, 0.0]]),
+            rows(&[[3.0, 5.0], [0.2, -0.1], [0.01, 0.0]]),
         );
-        assert_near(reconstruction(&goals, &executed), &[25.0, 0.0]);
-        assert_gradient(&executed, |executed| reconstruction(&goals, executed));
+        for (distance, expected) in [
+            (Distance::Square, [25.0, 0.0, 0.0001]),
+            (
+                Distance::Length,
+                [25.0025_f64.sqrt() - 0.05, 0.0, 0.0026_f64.sqrt() - 0.05],
+            ),
+        ] {
+            let loss = |executed: &Tensor| reconstruction(&goals, executed, distance);
+            assert_near(loss(&executed), &expected);
+            assert_gradient(&executed, loss);
+        }
     }
 
     #[test]

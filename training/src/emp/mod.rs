@@ -3,11 +3,13 @@
 pub mod ablation;
 pub mod data;
 pub mod falls;
+pub mod hindsight;
 pub mod imagination;
 pub mod imaginer;
 pub mod judge;
 pub mod learner;
 pub mod losses;
+pub mod memory;
 pub mod objective;
 pub mod report;
 pub mod rollout;

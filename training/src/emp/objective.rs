@@ -191,7 +191,7 @@ impl Objective {
         let [center_of_mass, foot_support] = self.balance(&outputs, &orientation)?;
         let links = columns(&outputs, &self.outputs.link_centers)?;
         Ok(Terms {
-            reconstruction: losses::reconstruction(&goals, &executed)?,
+            reconstruction: losses::reconstruction(&goals, &executed, self.settings.distance)?,
             orientation: losses::orientation(&orientation)?,
             collision: losses::collision(&links, &self.pairs)?,
             centroid: losses::centroid(&center_of_mass, &foot_support, self.reference)?,

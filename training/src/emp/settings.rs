@@ -9,7 +9,7 @@ use emp_robot::Robot;
 use emp_sim::tracking::TrackingSettings;
 use serde::{Deserialize, Serialize};
 
-use super::losses::{CenOn, CenRef, LossSettings, LossWeights, SmoothOn};
+use super::losses::{CenOn, CenRef, Distance, LossSettings, LossWeights, SmoothOn};
 use crate::world_model::settings::LearnerSettings;
 
 /// A set of settings with a name.
@@ -18,7 +18,7 @@ use crate::world_model::settings::LearnerSettings;
 pub enum Preset {
     /// The printed form: the paper's sizes, an absolute answer, losses on one imagined step.
     Paper,
-    /// The best that we found: a small network, a correction, and a price on falls that is learnt from real rollouts.
+    /// The best that we found: a small network, a correction, and what hindsight says of falls and contacts.
     Default,
 }
 
@@ -48,8 +48,6 @@ pub struct Settings {
     pub world_model: WorldModelSettings,
     /// What should have been asked for before a fall.
     pub hindsight: HindsightSettings,
-    /// What contacts and falls cost, learnt from real rollouts.
-    pub risk: RiskSettings,
     /// Steps of the optimiser.
     pub optimizer: OptimizerSettings,
     /// The motion and the conditions of the episodes.
@@ -124,55 +122,77 @@ pub struct WorldModelSettings {
     pub learner: LearnerSettings,
 }
 
-/// The lesson of falls. Once the robot has fallen, it is known of every moment of the last second or two that its goal should have
-/// been nearer the default pose. Where such moments look like others that end well, the EMP answers between the two.
+/// The lesson of falls and contacts: see [`Hindsight`](super::hindsight::Hindsight).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HindsightSettings {
-    /// Weight of ‖ĝ − (g₀ + amplitude · (g − g₀))‖² in the moments before a fall, g₀ the default pose. 0: no such loss.
+    /// Weight of the distance to what should have been executed against a fall. With it the reconstruction loss counts only where
+    /// the goal is known to have been right. 0: no hindsight.
     pub weight: f64,
-    /// Control periods before a fall that count.
-    pub frames: usize,
-    /// Share of the distance from the default pose that should have been asked for.
-    pub amplitude: f64,
-    /// Words in the names of the goal joints of which that is said: those that fell the robot.
-    pub joints: Vec<String>,
+    /// The same against a contact.
+    pub contact_weight: f64,
+    /// Control periods from one moment that is run again to the next.
+    pub window: usize,
+    /// Control periods within which a fall is a moment's.
+    pub horizon: usize,
+    /// Moments run again after a rollout, at most, times the goals that are tried in each.
+    pub replays: usize,
+    /// Mean change of a goal angle in a window that has to prove that it is needed, rad.
+    pub change: f64,
+    /// Mean force between the robot's own links in a window that is too much, N.
+    pub contact: f64,
+    /// Rows that had to be changed against a fall which are remembered.
+    pub memory: usize,
+    /// Of them, rows beside each mini-batch.
+    pub rows: usize,
+    /// What is tried before a fall.
+    pub against_falls: Vec<Remedy>,
+    /// What is tried where links press on one another.
+    pub against_contacts: Vec<Remedy>,
 }
 
-/// The price of falls and of what leads to them. One imagined period cannot see a fall that builds up over a second, and the
-/// simulator has no gradient; so the gradient of the expected cost of what really follows is estimated from rollouts with
-/// explored goals, by proximal policy optimisation.
+/// Tamer goals.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct RiskSettings {
-    /// Weight of the expected cost beside the six losses. 0: no exploration, no risk term.
-    pub weight: f64,
-    /// Cost of a fall.
-    pub fall: f64,
-    /// Cost of one period of `L_ori`, of the measured base.
-    pub orientation: f64,
-    /// Cost of one period of `L_cen`, where it is positive: of the measured centre of mass away from the policy's operating
-    /// point.
-    pub centroid: f64,
-    /// Cost of one period with 100 N between the robot's own links.
-    pub contact: f64,
-    /// Discount γ.
-    pub discount: f64,
-    /// Decay λ of the generalised advantage estimate.
-    pub trace_decay: f64,
-    /// The probability ratio is clipped to 1 ± this.
-    pub clip: f64,
-    /// Standard deviation of what is new in exploration in a control period, rad.
-    pub std: f64,
-    /// Share of the exploration of one control period that stays in the next; 0: white noise. A fall builds up over a
-    /// second: what lasts shows its effect, what is gone after 20 ms does not.
-    pub persistence: f64,
-    /// The step size follows this divergence between the EMP before the update and now.
-    pub target_divergence: f64,
-    /// Widths of the critic's hidden layers.
-    pub critic_hidden: Vec<usize>,
-    /// Step size of the critic.
-    pub critic_learning_rate: f64,
+pub struct Remedy {
+    /// Words in the names of the goal joints that it is for; the others stay as the EMP has them.
+    pub joints: Vec<String>,
+    /// Share of the distance from the default pose that is left.
+    pub amplitude: f64,
+    /// Highest speed of a goal angle, rad/s.
+    pub speed: f64,
+}
+
+impl Remedy {
+    fn new(joints: &[&str], amplitude: f64, speed: f64) -> Self {
+        Self {
+            joints: joints.iter().map(|word| (*word).to_owned()).collect(),
+            amplitude,
+            speed,
+        }
+    }
+
+    /// What falls of the shipped policy call for: waist, shoulder pitch and roll fell it (docs/emp.md).
+    fn against_falls() -> Vec<Self> {
+        let joints = ["waist", "shoulder_pitch", "shoulder_roll"];
+        [(1.0, 1.5), (0.8, 3.0), (0.6, 3.0), (0.4, 3.0)]
+            .map(|(amplitude, speed)| Self::new(&joints, amplitude, speed))
+            .to_vec()
+    }
+
+    /// Arms that rub along the body.
+    fn against_contacts() -> Vec<Self> {
+        let joints: [(&[&str], f64); 5] = [
+            (&["shoulder_roll"], 0.5),
+            (&["shoulder_roll"], 0.0),
+            (&["elbow"], 0.5),
+            (&["shoulder", "elbow"], 0.5),
+            (&["shoulder", "elbow", "wrist"], 0.3),
+        ];
+        joints
+            .map(|(joints, amplitude)| Self::new(joints, amplitude, 3.0))
+            .to_vec()
+    }
 }
 
 /// Steps of the optimiser after each rollout.
@@ -186,8 +206,8 @@ pub struct OptimizerSettings {
     /// Parts of a mini-batch whose gradients are computed in parallel and added in order. Fixed, whatever the number of
     /// threads: the sum's last bits depend on it.
     pub shards: usize,
-    /// Bounds of the step size; it starts at the upper one, and stays there without risk.
-    pub learning_rate: [f64; 2],
+    /// Step size.
+    pub learning_rate: f64,
     /// Bound of the gradient's norm.
     pub max_gradient_norm: f64,
     /// What is served is a running mean of the weights: after each rollout it keeps this share of itself. 0: the last weights.
@@ -231,32 +251,22 @@ impl Settings {
             },
             hindsight: HindsightSettings {
                 weight: 0.0,
-                frames: 100,
-                amplitude: 0.4,
-                joints: ["waist", "shoulder_pitch", "shoulder_roll"]
-                    .map(str::to_owned)
-                    .to_vec(),
-            },
-            risk: RiskSettings {
-                weight: 0.0,
-                fall: 1.0,
-                orientation: 0.05,
-                centroid: 0.0,
-                contact: 0.01,
-                discount: 0.99,
-                trace_decay: 0.95,
-                clip: 0.2,
-                std: 0.03,
-                persistence: 0.95,
-                target_divergence: 0.01,
-                critic_hidden: vec![256, 128, 64],
-                critic_learning_rate: 1e-3,
+                contact_weight: 60.0,
+                window: 50,
+                horizon: 150,
+                replays: 512,
+                change: 0.02,
+                contact: 2.0,
+                memory: 60_000,
+                rows: 512,
+                against_falls: Remedy::against_falls(),
+                against_contacts: Remedy::against_contacts(),
             },
             optimizer: OptimizerSettings {
                 updates: 8,
                 rows: 256,
                 shards: 4,
-                learning_rate: [1e-4, 1e-4],
+                learning_rate: 1e-4,
                 max_gradient_norm: 10.0,
                 averaging: 0.0,
             },
@@ -271,8 +281,8 @@ impl Settings {
     fn best() -> Self {
         let paper = Self::paper();
         Self {
-            environments: 256,
-            frames: 200,
+            environments: 128,
+            frames: 400,
             network: NetworkSettings {
                 differences: true,
                 output: Output::Residual,
@@ -285,7 +295,9 @@ impl Settings {
                 gate: DangerGate::PAPER,
             },
             losses: LossSettings {
+                distance: Distance::Length,
                 weights: LossWeights {
+                    reconstruction: 4.0,
                     orientation: 0.0,
                     collision: 0.0,
                     centroid: 0.0,
@@ -298,36 +310,38 @@ impl Settings {
             },
             horizon: 0,
             hindsight: HindsightSettings {
-                weight: 150.0,
+                weight: 200.0,
                 ..paper.hindsight.clone()
-            },
-            risk: RiskSettings {
-                weight: 1000.0,
-                fall: 0.0,
-                orientation: 0.0,
-                contact: 0.012,
-                target_divergence: 0.03,
-                ..paper.risk.clone()
             },
             optimizer: OptimizerSettings {
                 updates: 60,
                 rows: 2048,
                 shards: 4,
-                learning_rate: [3e-4, 1e-3],
+                learning_rate: 1e-3,
                 max_gradient_norm: 10.0,
                 averaging: 0.9,
             },
             episodes: TrackingSettings {
-                amplitude: [0.5, 2.0],
-                pushed: 0.1,
-                randomized: 0.1,
+                episode_frames: 400,
+                amplitude: [0.6, 2.2],
+                pushed: 0.2,
+                randomized: 0.2,
                 ..paper.episodes
             },
             ..paper
         }
     }
 
-    /// Changes one setting: `key` is its path with dots, as in `risk.weight`; `value` is JSON, or a bare word.
+    /// Control periods between two moments of a rollout that can be run again; 0: none can.
+    pub fn moments(&self) -> usize {
+        if self.hindsight.weight > 0.0 {
+            self.hindsight.window
+        } else {
+            0
+        }
+    }
+
+    /// Changes one setting: `key` is its path with dots, as in `hindsight.weight`; `value` is JSON, or a bare word.
     ///
     /// # Errors
     /// When there is no such setting, or it cannot have that value.
@@ -385,27 +399,37 @@ impl Settings {
                 "setting `optimizer.averaging` is {averaging}, expected 0 or more and less than 1"
             );
         }
-        let hindsight = &self.hindsight;
-        if hindsight.weight > 0.0 && !(1..self.frames).contains(&hindsight.frames) {
-            bail!(
-                "setting `hindsight.frames` is {}, expected 1 or more and less than `frames`, {}",
-                hindsight.frames,
-                self.frames
-            );
-        }
+        self.check_hindsight()?;
         if !(0.0..=1.0).contains(&self.live) {
             bail!(
                 "setting `live` is {}, expected a share from 0 to 1",
                 self.live
             );
         }
-        if self.risk.weight < 0.0 || self.risk.std <= 0.0 {
-            bail!("settings `risk.weight` and `risk.std` must not be negative, nor `risk.std` 0");
+        Ok(())
+    }
+
+    fn check_hindsight(&self) -> Result<()> {
+        let (hindsight, frames) = (&self.hindsight, self.frames);
+        if hindsight.weight == 0.0 {
+            return Ok(());
         }
-        if !(0.0..1.0).contains(&self.risk.persistence) {
-            let persistence = self.risk.persistence;
+        let HindsightSettings {
+            window, horizon, ..
+        } = hindsight;
+        for (name, count) in [("memory", hindsight.memory), ("rows", hindsight.rows)] {
+            if count == 0 {
+                bail!("setting `hindsight.{name}` is 0, expected at least 1");
+            }
+        }
+        if !(1..=frames).contains(horizon) {
             bail!(
-                "setting `risk.persistence` is {persistence}, expected 0 or more and less than 1"
+                "setting `hindsight.horizon` is {horizon}, expected 1 or more and at most `frames`, {frames}"
+            );
+        }
+        if !(1..=*horizon).contains(window) {
+            bail!(
+                "setting `hindsight.window` is {window}, expected 1 or more and at most `hindsight.horizon`, {horizon}"
             );
         }
         Ok(())
@@ -419,16 +443,16 @@ mod tests {
     #[test]
     fn settings_are_changed_by_their_path_and_mistakes_are_named() {
         let mut settings = Settings::preset(Preset::Paper);
-        settings.set("risk.weight", "20").unwrap();
+        settings.set("hindsight.weight", "20").unwrap();
         settings.set("losses.smooth_on", "correction").unwrap();
         settings.set("network.gate", r#"{"tilt": 0.3}"#).unwrap();
         settings.set("network.state_hidden", "[32]").unwrap();
-        assert_eq!(settings.risk.weight, 20.0);
+        assert_eq!(settings.hindsight.weight, 20.0);
         assert_eq!(settings.losses.smooth_on, SmoothOn::Correction);
         assert_eq!(settings.network.gate, DangerGate::Tilt(0.3));
         assert_eq!(settings.network.state_hidden, [32]);
         for (key, value) in [
-            ("risk.wait", "1"),
+            ("hindsight.wait", "1"),
             ("horizon", "-1"),
             ("losses.cen_on", "moon"),
         ] {
@@ -452,7 +476,7 @@ mod tests {
         assert_eq!(paper.network.config(&robot), EmpConfig::paper(&robot));
         assert_eq!(paper.losses, LossSettings::default());
         assert_eq!(
-            (paper.horizon, paper.wm_loss_steps, paper.risk.weight),
+            (paper.horizon, paper.wm_loss_steps, paper.hindsight.weight),
             (1, 1, 0.0)
         );
     }

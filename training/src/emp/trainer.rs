@@ -18,11 +18,12 @@ use emp_sim::{Pool, goals::GoalClip, tracking::TrackingEnvironments};
 use serde::{Deserialize, Serialize};
 
 use super::{
+    hindsight::{Counts, Hindsight},
     imaginer::Imaginer,
     judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics, WarmUp},
     objective::Terms,
-    rollout::{Cost, CostSums, Exploration, Explorer},
+    rollout::Collector,
     settings::Settings,
 };
 use crate::{
@@ -31,7 +32,7 @@ use crate::{
 };
 use emp_models::policy::Policy;
 
-/// Kind of the checkpoints in a run's folder, which hold the critic, the optimisers and the environments too.
+/// Kind of the checkpoints in a run's folder, which hold the optimiser and the environments too.
 const RUN_KIND: &str = "emp-run";
 
 /// Snapshots in a checkpoint: of the EMP's environments, and of the world model's.
@@ -39,21 +40,22 @@ const ENVIRONMENTS: &str = "environments";
 const IMAGINED_ENVIRONMENTS: &str = "environments.world-model";
 
 /// Columns of the log after the step and the losses.
-const COLUMNS: [&str; 15] = [
+const COLUMNS: [&str; 16] = [
     "world_model",
     "hindsight",
-    "risk",
     "falls",
-    "tilt",
-    "centroid_measured",
     "contact",
     "mean_change",
     "episodes",
-    "explained_variance",
-    "kl",
-    "learning_rate",
     "gradient_norm",
+    "moments_before_falls",
+    "avoidable",
+    "moments_of_contacts",
+    "relievable",
+    "moments_of_changes",
+    "needed",
     "seconds_collecting",
+    "seconds_replaying",
     "seconds_learning",
 ];
 
@@ -78,7 +80,7 @@ pub struct Trainer {
     settings: Settings,
     /// Settings that the run had before, with the steps at which they were left.
     past: Vec<Phase>,
-    explorer: Explorer,
+    collector: Collector,
     learner: Learner,
     /// The world model, where anything is imagined.
     imaginer: Option<Imaginer>,
@@ -122,16 +124,9 @@ impl Trainer {
     /// When a setting is out of bounds, or the robot falls whatever it is asked for.
     pub fn new(equipment: Equipment, settings: Settings) -> Result<Self> {
         settings.check()?;
-        let seed = settings.seed;
-        let mut explorer = Explorer::new(environments(&equipment, &settings, seed)?, seed);
-        let cost = Cost {
-            settings: &settings.risk,
-            reference: [0.0; 2],
-        };
-        let threads = &equipment.threads;
-        let unexplored = Exploration::default();
-        let rollout = explorer.collect(None, unexplored, settings.warm_up, &cost, threads)?;
-        let layout = *explorer.environments().layout();
+        let mut collector = Collector::new(environments(&equipment, &settings, settings.seed)?);
+        let rollout = collector.collect(None, settings.warm_up, 0, &equipment.threads)?;
+        let layout = *collector.environments().layout();
         let warm_up = WarmUp::new(rollout, &layout)?;
         Ok(Self {
             learner: Learner::new(&equipment.robot, &settings, &warm_up)?,
@@ -139,7 +134,7 @@ impl Trainer {
                 0 => None,
                 _ => Some(Imaginer::new(&equipment, &settings)?),
             },
-            explorer,
+            collector,
             equipment,
             settings,
             past: Vec::new(),
@@ -190,7 +185,7 @@ impl Trainer {
                 .with_context(|| path.display().to_string())?;
         }
         trainer
-            .explorer
+            .collector
             .restore(&environments)
             .with_context(|| path.display().to_string())?;
         trainer
@@ -258,7 +253,7 @@ impl Trainer {
     /// When the file cannot be written.
     pub fn save_run(&self, path: &Path) -> Result<()> {
         let mut tensors = self.learner.state()?;
-        let mut snapshots = vec![(ENVIRONMENTS, self.explorer.snapshot()?)];
+        let mut snapshots = vec![(ENVIRONMENTS, self.collector.snapshot()?)];
         let mut counts = None;
         if let Some(imaginer) = &self.imaginer {
             let (environments, imaginers) = imaginer.save(&mut tensors)?;
@@ -291,41 +286,40 @@ impl Trainer {
             imagination = Some(imaginer.imagination(&self.equipment)?);
         }
         let start = Instant::now();
-        let risk = &self.settings.risk;
-        let cost = Cost {
-            settings: risk,
-            reference: self.learner.reference(),
-        };
-        let exploration = if risk.weight > 0.0 {
-            Exploration {
-                std: risk.std,
-                persistence: risk.persistence,
-            }
-        } else {
-            Exploration::default()
-        };
         let threads = &self.equipment.threads;
         let network = self.learner.network().clone();
         let frames = self.settings.frames;
+        let moments = self.settings.moments();
         let rollout = self
-            .explorer
-            .collect(Some(&network), exploration, frames, &cost, threads)?;
+            .collector
+            .collect(Some(&network), frames, moments, threads)?;
         let collecting = start.elapsed().as_secs_f64();
-        let update = self
-            .learner
-            .update(&rollout, imagination.as_ref(), threads)?;
+        let start = Instant::now();
+        let mut labels = None;
+        if self.settings.hindsight.weight > 0.0 {
+            let hindsight = Hindsight::new(&self.equipment.robot, &self.settings.hindsight);
+            let seed = self.settings.seed.wrapping_add(self.steps);
+            let found = hindsight.labels(&rollout, &self.collector, &network, seed, threads);
+            labels = Some(found?);
+        }
+        let replaying = start.elapsed().as_secs_f64();
+        let update =
+            self.learner
+                .update(&rollout, labels.as_ref(), imagination.as_ref(), threads)?;
         let rows = rollout.rows();
         self.steps += rows as u64;
-        let changes = rollout.means.iter().zip(&rollout.goals);
+        let changes = rollout.answers.iter().zip(&rollout.goals);
         let change: f64 = changes.map(|(a, b)| f64::from((a - b).abs())).sum();
         Ok(Step {
-            change: change / rollout.means.len() as f64,
-            sums: rollout.sums,
+            change: change / rollout.answers.len() as f64,
+            falls: rollout.falls(),
+            contact: mean(&rollout.contact),
             episodes: rollout.episodes(),
             world_model,
-            rows,
             update,
             collecting,
+            replaying,
+            counts: labels.map(|labels| labels.counts).unwrap_or_default(),
         })
     }
 }
@@ -334,34 +328,38 @@ impl Trainer {
 struct Step {
     /// Loss of the world model; not a number without one.
     world_model: f64,
-    sums: CostSums,
+    falls: usize,
+    /// Mean force between the robot's own links, N.
+    contact: f64,
     /// Mean absolute change of a goal angle, rad.
     change: f64,
     episodes: usize,
-    rows: usize,
     update: UpdateStatistics,
     collecting: f64,
+    replaying: f64,
+    counts: Counts,
 }
 
 impl Step {
     fn row(&self) -> Vec<f64> {
-        let (sums, update, rows) = (&self.sums, &self.update, self.rows as f64);
+        let (update, counts) = (&self.update, &self.counts);
         let mut row = update.terms.to_vec();
         row.extend([
             self.world_model,
             update.hindsight,
-            update.risk,
-            sums.falls,
-            sums.orientation / rows,
-            sums.centroid / rows,
-            sums.contact / rows,
+            self.falls as f64,
+            self.contact,
             self.change,
             self.episodes as f64,
-            update.explained_variance,
-            update.divergence,
-            update.learning_rate,
             update.gradient_norm,
+            counts.falls as f64,
+            counts.avoidable as f64,
+            counts.contacts as f64,
+            counts.relievable as f64,
+            counts.changes as f64,
+            counts.needed as f64,
             self.collecting,
+            self.replaying,
             update.seconds,
         ]);
         row
@@ -370,10 +368,7 @@ impl Step {
     fn message(&self) -> String {
         format!(
             "falls {} of {} change {:.3} rad contact {:.1} N",
-            self.sums.falls,
-            self.episodes,
-            self.change,
-            self.sums.contact / self.rows as f64,
+            self.falls, self.episodes, self.change, self.contact,
         )
     }
 }
@@ -439,6 +434,11 @@ pub(super) fn environments(
         0..settings.environments as u64,
         seed,
     )?)
+}
+
+fn mean(values: &[f32]) -> f64 {
+    let sum: f64 = values.iter().copied().map(f64::from).sum();
+    sum / values.len().max(1) as f64
 }
 
 fn run_metadata(robot: &Robot) -> CheckpointMetadata {

@@ -9,8 +9,8 @@ use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor, backprop::GradStore};
 use emp_models::{
     checkpoint::Tensors,
+    mlp::Normalizer,
     optimizer::{Adam, AdamConfig},
-    policy::Normalizer,
 };
 use emp_sim::{End, Rollout};
 use rand::{SeedableRng as _, seq::SliceRandom as _};

@@ -2,7 +2,7 @@
 
 use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
-use emp_models::{checkpoint::Tensors, policy::Normalizer};
+use emp_models::{checkpoint::Tensors, mlp::Normalizer};
 
 /// Added to each deviation, so that a constant feature has a finite scale.
 const EPSILON: f64 = 1e-4;

@@ -3,7 +3,7 @@
 use anyhow::{Context as _, Result};
 use candle_core::{DType, Device, Tensor, Var};
 use candle_nn::{VarBuilder, VarMap};
-use emp_models::{checkpoint::Tensors, policy::Mlp};
+use emp_models::{checkpoint::Tensors, mlp::Mlp};
 use nalgebra::DMatrix;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;

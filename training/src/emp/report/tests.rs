@@ -5,8 +5,8 @@ use candle_nn::{VarBuilder, VarMap};
 use emp_models::{
     controller::{ControllerOutput, Risk},
     emp::{DangerGate, EmpConfig, EmpNetwork, Output},
+    mlp::Normalizer,
     observation::HistoryMap,
-    policy::Normalizer,
 };
 use emp_robot::Robot;
 use emp_sim::{Priority, Reading, evaluation::ExecutedFrame, goals::Source};

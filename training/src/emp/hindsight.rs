@@ -240,7 +240,7 @@ impl<'a> Hindsight<'a> {
 
     fn candidates(&self, window: &Window) -> Vec<Candidate> {
         let mut candidates = Vec::new();
-        if window.changed {
+        if window.fell || window.changed {
             candidates.push(Candidate::Asked);
         }
         let falls = self.settings.against_falls.len();
@@ -633,6 +633,7 @@ mod tests {
         let answer: Vec<f32> = default.iter().map(|angle| angle + 0.3).collect();
         let mut replay = replay(Candidate::Tamed(0), End::None, 0.0);
         replay.goals.clear();
+        replay.lived = 0;
         replay.held = asked.clone();
         // 5 rad/s are 0.1 rad a control period.
         for expected in [0.3, 0.2, 0.2] {
@@ -649,7 +650,7 @@ mod tests {
             replay.come_of(End::None, 1.0, 2);
         }
         assert_eq!(replay.goals.len(), 2 * default.len());
-        assert_eq!((replay.contact, replay.lived), (2.0, 4));
+        assert_eq!((replay.contact, replay.lived), (2.0, 3));
         for (candidate, change) in [(Candidate::Asked, 0.4), (Candidate::Half, 0.35)] {
             replay.candidate = candidate;
             let goal = hindsight.goal(&replay, &asked, &answer);

@@ -456,7 +456,7 @@ mod tests {
                 "reconstruction": 20.0, "orientation": 10.0, "collision": 1.0,
                 "centroid": 10.0, "smoothness": 100.0, "regularization": 1.0,
             },
-            "smooth_on": "target", "cen_on": "predicted", "cen_ref": "center",
+            "distance": "square", "smooth_on": "target", "cen_on": "predicted", "cen_ref": "center",
         }))
         .unwrap();
         assert_eq!(settings, LossSettings::default());

@@ -251,11 +251,11 @@ impl Settings {
             },
             hindsight: HindsightSettings {
                 weight: 0.0,
-                contact_weight: 60.0,
+                contact_weight: 30.0,
                 window: 50,
                 horizon: 150,
-                replays: 512,
-                change: 0.02,
+                replays: 640,
+                change: 0.015,
                 contact: 2.0,
                 memory: 60_000,
                 rows: 512,
@@ -324,8 +324,8 @@ impl Settings {
             episodes: TrackingSettings {
                 episode_frames: 400,
                 amplitude: [0.6, 2.2],
-                pushed: 0.2,
-                randomized: 0.2,
+                pushed: 0.1,
+                randomized: 0.1,
                 ..paper.episodes
             },
             ..paper

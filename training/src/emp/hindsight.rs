@@ -179,34 +179,38 @@ impl<'a> Hindsight<'a> {
         self.run(&mut replays, &doubts, rollout, collector, network, threads)?;
         for replays in replays.chunk_by(|a, b| a.window == b.window) {
             let window = &doubts[replays[0].window];
-            labels.judge(window, replays, rollout, self.settings.contact);
+            labels.judge(window, replays, rollout, self.contact());
         }
         Ok(labels)
+    }
+
+    /// The contact that is too much, N.
+    fn contact(&self) -> f64 {
+        if self.settings.contact_weight > 0.0 {
+            self.settings.contact
+        } else {
+            f64::INFINITY
+        }
     }
 
     /// The moments whose future is known as far as the horizon, or to the episode's end.
     fn windows(&self, rollout: &Rollout) -> Vec<Window> {
         let mut windows = Vec::new();
-        for (moment, start) in rollout
-            .moments
-            .iter()
-            .map(|moment| moment.period)
-            .enumerate()
-        {
+        for (index, moment) in rollout.moments.iter().enumerate() {
             for environment in 0..rollout.environments {
-                let lived = rollout.lived(start, environment, self.settings.horizon);
+                let lived = rollout.lived(moment.period, environment, self.settings.horizon);
                 let Some((lived, end)) = lived.filter(|(_, end)| *end != End::Diverged) else {
                     continue;
                 };
                 let mut window = Window {
                     environment,
-                    moment,
+                    moment: index,
                     periods: lived.min(self.settings.window),
                     fell: end == End::Terminated,
                     touched: false,
                     changed: false,
                 };
-                window.touched = window.contact(rollout) > self.settings.contact;
+                window.touched = window.contact(rollout) > self.contact();
                 window.changed = window.change(rollout) > self.settings.change;
                 windows.push(window);
             }

@@ -129,7 +129,7 @@ pub struct HindsightSettings {
     /// Weight of the distance to what should have been executed against a fall. With it the reconstruction loss counts only where
     /// the goal is known to have been right. 0: no hindsight.
     pub weight: f64,
-    /// The same against a contact.
+    /// The same against a contact. 0: contacts are let be.
     pub contact_weight: f64,
     /// Control periods from one moment that is run again to the next.
     pub window: usize,
@@ -182,12 +182,13 @@ impl Remedy {
 
     /// Arms that rub along the body.
     fn against_contacts() -> Vec<Self> {
-        let joints: [(&[&str], f64); 5] = [
+        let joints: [(&[&str], f64); 6] = [
+            (&["shoulder_roll"], 0.75),
             (&["shoulder_roll"], 0.5),
             (&["shoulder_roll"], 0.0),
+            (&["elbow"], 0.75),
             (&["elbow"], 0.5),
             (&["shoulder", "elbow"], 0.5),
-            (&["shoulder", "elbow", "wrist"], 0.3),
         ];
         joints
             .map(|(joints, amplitude)| Self::new(joints, amplitude, 3.0))
@@ -251,11 +252,11 @@ impl Settings {
             },
             hindsight: HindsightSettings {
                 weight: 0.0,
-                contact_weight: 30.0,
+                contact_weight: 0.0,
                 window: 50,
                 horizon: 150,
                 replays: 640,
-                change: 0.015,
+                change: 0.01,
                 contact: 2.0,
                 memory: 60_000,
                 rows: 512,
@@ -310,7 +311,7 @@ impl Settings {
             },
             horizon: 0,
             hindsight: HindsightSettings {
-                weight: 200.0,
+                weight: 300.0,
                 ..paper.hindsight.clone()
             },
             optimizer: OptimizerSettings {

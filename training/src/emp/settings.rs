@@ -293,7 +293,8 @@ impl Settings {
                 fusion_hidden: vec![256, 128],
                 latent: 32,
                 decoder_hidden: vec![128, 128],
-                gate: DangerGate::PAPER,
+                // What 1 % of the frames of nominal training motion exceed.
+                gate: DangerGate::Regloss(0.0055),
             },
             losses: LossSettings {
                 distance: Distance::Length,

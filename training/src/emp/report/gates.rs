@@ -45,7 +45,7 @@ pub struct GateRow {
     pub(super) too_late: usize,
 }
 
-/// The gates of `candidate`: none, the paper's, by percentile of regloss in frames of the policy alone under nominal conditions,
+/// The gates of `candidate`: none, its own, the paper's, by percentile of regloss in frames of the policy alone under nominal conditions,
 /// and by tilt.
 pub(super) fn compare(
     run: &EmpRun<'_>,
@@ -105,7 +105,10 @@ fn gates(
     let mut safe = Regloss::default();
     let controller = gated(run, candidate, never);
     evaluation(run, &controller, Condition::Nominal, &mut safe, progress)?;
-    let mut gates = vec![(DangerGate::PAPER, "the paper's".to_owned())];
+    let mut gates = vec![
+        (candidate.emp.config().gate, "the checkpoint's".to_owned()),
+        (DangerGate::PAPER, "the paper's".to_owned()),
+    ];
     for share in PERCENTILES {
         let limit = percentile(safe.0.clone(), share);
         let origin = format!("p{:.0} of nominal frames", 100.0 * share);

@@ -68,8 +68,9 @@ impl EvaluatedMode {
 }
 
 impl Trials {
-    /// Plays the first motion that fells the robot without the EMP, or the one that tilts it most if none does; then the same
-    /// with the EMP; then has the server count the falls over all motions.
+    /// Plays the first motion that the robot falls in without the EMP and stands with it (if there is none, the first that it falls in
+    /// without; if it never falls, the one that tilts it most), without and with the EMP; then has the server count the falls over
+    /// all motions.
     ///
     /// No clock is in it: control periods are in lock step with their answers, so that the same motion is found on every machine.
     pub(crate) async fn play(
@@ -78,19 +79,13 @@ impl Trials {
         robot: &Arc<Robot>,
         has_emp: bool,
     ) -> Result<Comparison> {
-        let Fallen {
+        let Trial {
             number,
             motion,
-            run: off,
-        } = self.first_fall(client, robot).await?;
+            off,
+            on,
+        } = self.telling(client, robot, has_emp).await?;
         let conditions = self.conditions(robot, number);
-        let on = match has_emp {
-            true => Some(
-                self.run(client, robot, number, &motion, EmpMode::On)
-                    .await?,
-            ),
-            false => None,
-        };
         eprintln!("counting falls over {} motions", self.motions.sources.len());
         let mut counts = Vec::new();
         for mode in [EvaluatedMode::Off, EvaluatedMode::On] {
@@ -109,38 +104,55 @@ impl Trials {
         })
     }
 
-    async fn first_fall(&self, client: &Client, robot: &Arc<Robot>) -> Result<Fallen> {
-        let mut worst: Option<(f64, Fallen)> = None;
+    /// The motion that tells most, in the order that [`play`](Self::play) gives.
+    async fn telling(&self, client: &Client, robot: &Arc<Robot>, has_emp: bool) -> Result<Trial> {
+        let mut best: Option<(f64, Trial)> = None;
         for number in 0..self.motions.sources.len() {
-            let motion = self.motions.perform(number, client, robot).await?;
-            let run = self
-                .run(client, robot, number, &motion, EmpMode::Off)
-                .await?;
-            let fell = run.fall.is_some();
+            let trial = self.trial(client, robot, number, has_emp).await?;
             eprintln!(
-                "hard motion {} of {}, {}: {} without the EMP",
+                "hard motion {} of {}, {}: {}",
                 number + 1,
                 self.motions.sources.len(),
-                motion.name,
-                if fell { "falls" } else { "stands" }
+                trial.motion.name,
+                trial.outcome()
             );
-            let tilts = run.periods.iter().map(|period| tilt(&period.reading));
-            let largest = tilts.fold(0.0, f64::max);
-            let this = Fallen {
-                number,
-                motion,
-                run,
-            };
-            if fell {
-                return Ok(this);
+            if trial.is_saved() || (trial.off.fall.is_some() && !has_emp) {
+                return Ok(trial);
             }
-            if worst.as_ref().is_none_or(|(tilt, _)| *tilt < largest) {
-                worst = Some((largest, this));
+            let weight = trial.weight();
+            if best.as_ref().is_none_or(|(most, _)| *most < weight) {
+                best = Some((weight, trial));
             }
         }
-        worst
-            .map(|(_, worst)| worst)
+        best.map(|(_, trial)| trial)
             .context("there is no motion to compare with")
+    }
+
+    /// One motion without the EMP and, where the robot has one, with it.
+    async fn trial(
+        &self,
+        client: &Client,
+        robot: &Arc<Robot>,
+        number: usize,
+        has_emp: bool,
+    ) -> Result<Trial> {
+        let motion = self.motions.perform(number, client, robot).await?;
+        let off = self
+            .run(client, robot, number, &motion, EmpMode::Off)
+            .await?;
+        let on = match has_emp {
+            true => Some(
+                self.run(client, robot, number, &motion, EmpMode::On)
+                    .await?,
+            ),
+            false => None,
+        };
+        Ok(Trial {
+            number,
+            motion,
+            off,
+            on,
+        })
     }
 
     async fn run(
@@ -210,12 +222,45 @@ impl Trials {
     }
 }
 
-/// The motion that was looked for, and how it went without the EMP.
-struct Fallen {
-    /// From 0.
+/// A hard motion, played.
+struct Trial {
+    /// Index of the motion.
     number: usize,
     motion: Motion,
-    run: Run,
+    off: Run,
+    on: Option<Run>,
+}
+
+impl Trial {
+    /// Whether the robot falls without the EMP and stands with it.
+    fn is_saved(&self) -> bool {
+        self.off.fall.is_some() && self.on.as_ref().is_some_and(|on| on.fall.is_none())
+    }
+
+    /// How much it tells: a fall without the EMP more than any tilt, rad.
+    fn weight(&self) -> f64 {
+        if self.off.fall.is_some() {
+            return f64::INFINITY;
+        }
+        let tilts = self.off.periods.iter().map(|period| tilt(&period.reading));
+        tilts.fold(0.0, f64::max)
+    }
+
+    fn outcome(&self) -> String {
+        let verb = |run: &Run| {
+            if run.fall.is_some() {
+                "falls"
+            } else {
+                "stands"
+            }
+        };
+        let on = self.on.as_ref().map(|on| format!(", {} with it", verb(on)));
+        format!(
+            "{} without the EMP{}",
+            verb(&self.off),
+            on.unwrap_or_default()
+        )
+    }
 }
 
 /// What is said of a comparison.
@@ -225,7 +270,7 @@ pub(crate) struct ComparisonSummary {
     robot: String,
     /// The motion's name.
     motion: String,
-    /// Its number among the hard motions, from 1: the first that fells the robot without the EMP, or the one that tilts it most.
+    /// Its number among the hard motions, from 1.
     number: usize,
     /// Factor on the distance of its goals from the default pose.
     amplitude: f64,
@@ -341,8 +386,14 @@ impl ComparisonSummary {
 
     /// How the motion was chosen, and how all of its kind went, in a line.
     pub(crate) fn choice(&self) -> String {
-        let Self { number, off, .. } = self;
+        let Self {
+            number, off, on, ..
+        } = self;
+        let saved = on.as_ref().is_some_and(|on| on.fall().is_none());
         let rule = match off.fall() {
+            Some(_) if saved => {
+                "the first in which the robot falls without the EMP and stands with it"
+            }
             Some(_) => "the first that fells the robot without the EMP",
             None => "none fells the robot without the EMP, and this one tilts it most",
         };

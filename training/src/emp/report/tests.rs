@@ -143,18 +143,18 @@ fn every_controller_is_compared_on_the_same_episodes() {
     );
 
     let gates: Vec<Option<DangerGate>> = report.gates.iter().map(|row| row.gate).collect();
-    assert_eq!((gates.len(), gates[0]), (9, None));
+    assert_eq!((gates.len(), gates[0]), (10, None));
     assert!(gates.contains(&Some(DangerGate::PAPER)));
     let acting = |row: &GateRow| row.nominal.metrics.changed_share.mean;
     assert!(acting(&report.gates[0]) > 0.9);
     // A higher threshold lets the EMP act less.
-    for pair in report.gates[2..5]
+    for pair in report.gates[3..6]
         .windows(2)
-        .chain(report.gates[5..].windows(2))
+        .chain(report.gates[6..].windows(2))
     {
         assert!(acting(&pair[0]) >= acting(&pair[1]), "{pair:?}");
     }
-    assert!(acting(&report.gates[2]) > acting(&report.gates[4]));
+    assert!(acting(&report.gates[3]) > acting(&report.gates[5]));
 
     let text = report.to_string();
     for part in [

@@ -68,7 +68,7 @@ pub enum Distance {
     /// ‖x‖², as printed. Between two wishes the best answer is their weighted mean.
     #[default]
     Square,
-    /// ‖x‖, rounded off below [`ROUNDING`]. Between two wishes the best answer is the weightier one.
+    /// ‖x‖, rounded off below 0.05 rad. Between two wishes the best answer is the weightier one.
     Length,
 }
 

@@ -181,6 +181,10 @@ impl Memory {
                 counts.len()
             );
         };
+        ensure!(
+            (0.0..=rows as f64).contains(&next) && next < self.capacity as f64,
+            "tensor `{PREFIX}.counts`: row {next} of {rows} cannot be the next"
+        );
         self.next = next as usize;
         self.share = share;
         self.rollouts = rollouts as u64;

@@ -419,6 +419,17 @@ impl Settings {
         let HindsightSettings {
             window, horizon, ..
         } = hindsight;
+        let mut remedies = hindsight
+            .against_falls
+            .iter()
+            .chain(&hindsight.against_contacts);
+        if let Some(remedy) = remedies.find(|remedy| {
+            !(remedy.speed > 0.0 && remedy.speed.is_finite() && remedy.amplitude.is_finite())
+        }) {
+            bail!(
+                "a remedy of `hindsight` is {remedy:?}, expected a speed above 0 and a finite amplitude"
+            );
+        }
         for (name, count) in [("memory", hindsight.memory), ("rows", hindsight.rows)] {
             if count == 0 {
                 bail!("setting `hindsight.{name}` is 0, expected at least 1");

@@ -9,47 +9,11 @@ use serde::{Deserialize, Serialize};
 use crate::{
     ModelError,
     emp::Emp,
-    filters::{self, FilterError},
+    filters::{self, DECOUPLED, FilterError, FilterItem, GoalFilter, Risk},
     guard::{Execution, ExecutionGuard},
     observation::{History, ObservationLayout, RobotState},
     policy::Policy,
 };
-
-/// Changes goals before they are executed: the EMP, or one of the simple rules of [`crate::filters`] to compare it with.
-pub trait GoalFilter: Send + Sync {
-    /// The filter's name, as a controller is called.
-    fn name(&self) -> &str;
-
-    /// Replaces each goal by the one to execute.
-    ///
-    /// # Errors
-    /// When a model fails; then the whole batch has no answer.
-    fn filter(&self, batch: &mut [FilterItem<'_>]) -> Result<(), ModelError>;
-}
-
-/// One robot's goal, on its way through a filter.
-#[derive(Debug)]
-pub struct FilterItem<'a> {
-    /// The stack `S_t` with the goal that was asked for in its newest frame.
-    pub observation: &'a [f32],
-    /// The goal, rad: in, as asked for; out, to be executed.
-    pub goal: &'a mut [f32],
-    /// What the filter remembers of this robot; empty at reset, otherwise the filter's own.
-    pub memory: &'a mut Vec<f32>,
-    /// How dangerous the filter finds the goal, for filters that judge it; none before.
-    pub risk: &'a mut Option<Risk>,
-}
-
-/// How dangerous an EMP finds a goal.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Risk {
-    /// Mean of z² over the latent's dimensions.
-    pub regloss: f32,
-    /// Whether the danger gate is passed.
-    pub danger: bool,
-    /// Share of the correction that is executed, 0 to 1.
-    pub applied: f32,
-}
 
 /// One robot's past.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -221,15 +185,12 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// The name of the controller without a filter: the goal goes to the robot as it is.
-    pub const DECOUPLED: &'static str = "decoupled";
-
     /// A controller; without a filter it is the paper's decoupled policy.
     pub fn new(policy: Arc<Policy>, filter: Option<Arc<dyn GoalFilter>>) -> Self {
         Self { policy, filter }
     }
 
-    /// The controller that `specification` asks for: [`Self::DECOUPLED`] or a filter of [`filters::LIST`], with parameters.
+    /// The controller that `specification` asks for: [`DECOUPLED`] or a filter of [`filters::LIST`], with parameters.
     ///
     /// # Errors
     /// As of [`filters::by_name`].
@@ -242,11 +203,11 @@ impl Controller {
         Ok(Self::new(Arc::clone(policy), filter))
     }
 
-    /// The filter's name, or [`Self::DECOUPLED`].
+    /// The filter's name, or [`DECOUPLED`].
     pub fn name(&self) -> &str {
         self.filter
             .as_ref()
-            .map_or(Self::DECOUPLED, |filter| filter.name())
+            .map_or(DECOUPLED, |filter| filter.name())
     }
 
     /// The policy.

@@ -7,7 +7,8 @@ use candle_nn::{VarBuilder, VarMap};
 use emp_models::{
     ModelError,
     checkpoint::Tensors,
-    controller::{Controller, ControllerInput, ControllerState, FilterItem, GoalFilter},
+    controller::{Controller, ControllerInput, ControllerState},
+    filters::{DECOUPLED, FilterItem, GoalFilter},
     guard::{ExecutionGuard, GuardSettings},
     mlp::{Mlp, Normalizer},
     observation::RobotState,
@@ -171,7 +172,7 @@ fn what_the_guard_leaves_is_executed_and_observed() {
 #[test]
 fn a_robot_in_a_batch_is_a_robot_alone() {
     let controller = Controller::new(policy(), None);
-    assert_eq!(controller.name(), Controller::DECOUPLED);
+    assert_eq!(controller.name(), DECOUPLED);
     let mut together: Vec<ControllerState> = (0..3).map(|_| controller.state()).collect();
     let mut alone = controller.state();
     for t in 0..20 {

@@ -7,10 +7,10 @@ use emp_models::{
     ModelError,
     assessment::{Assessment, GoalPath, assess},
     controller::{
-        Controller, ControllerInput, ControllerOutput, ControllerState, FilteredGoal, GoalFilter,
-        filter_goals,
+        Controller, ControllerInput, ControllerOutput, ControllerState, FilteredGoal, filter_goals,
     },
-    emp::{Emp, EmpFilter},
+    emp::Emp,
+    filters::{EmpFilter, GoalFilter},
     guard::Execution,
     observation::{ObservationLayout, RobotState},
     policy::Policy,

@@ -2,7 +2,7 @@
 
 use emp_models::{
     controller::ControllerState,
-    emp::EmpFilter,
+    filters::EmpFilter,
     observation::{ObservationLayout, RobotState},
 };
 use emp_proto::v1;

@@ -5,7 +5,8 @@ use std::time::Duration;
 use emp_models::{
     CheckpointMetadata,
     assessment::{Assessment, Reason},
-    controller::{ControllerOutput, Risk},
+    controller::ControllerOutput,
+    filters::Risk,
     retarget::AT_LIMIT,
 };
 use emp_proto::v1;

@@ -10,10 +10,9 @@ use emp_client::{
 };
 use emp_models::{
     assessment::{GoalPath, assess},
-    controller::{
-        Controller, ControllerInput, ControllerState, FilteredGoal, GoalFilter, filter_goals,
-    },
-    emp::{Emp, EmpFilter},
+    controller::{Controller, ControllerInput, ControllerState, FilteredGoal, filter_goals},
+    emp::Emp,
+    filters::{EmpFilter, GoalFilter},
     observation::RobotState,
 };
 use emp_proto::v1::{

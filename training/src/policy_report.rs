@@ -4,7 +4,7 @@ use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::{Context as _, Result};
 use clap::Args;
-use emp_models::{checkpoint::write_atomically, controller::Controller};
+use emp_models::{checkpoint::write_atomically, controller::Controller, filters::DECOUPLED};
 use emp_training::policy::report;
 
 use crate::{
@@ -20,7 +20,7 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     trial: TrialArguments,
     /// What stands before the policy: `decoupled` for nothing, or a filter, with parameters as `NAME:key=value,…`.
-    #[arg(long, num_args = 1.., value_name = "NAME", default_value = Controller::DECOUPLED)]
+    #[arg(long, num_args = 1.., value_name = "NAME", default_value = DECOUPLED)]
     controllers: Vec<String>,
     /// Climb the difficulty ladder instead (amplitude, speed, hand load, pushes) and write ladder.csv and ladder.svg here.
     #[arg(long, value_name = "DIR")]

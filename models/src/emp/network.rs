@@ -3,7 +3,10 @@
 use candle_core::Tensor;
 use candle_nn::VarBuilder;
 
-use super::{EmpConfig, Output, PackedNetwork};
+use super::{
+    config::{EmpConfig, Output},
+    packed::PackedNetwork,
+};
 use crate::{
     checkpoint::Tensors,
     mlp::{Mlp, Normalizer},

@@ -2,7 +2,8 @@ use candle_core::Tensor;
 use candle_nn::VarMap;
 
 use super::*;
-use crate::controller::{FilterItem, GoalFilter as _, Risk};
+use crate::filters::{EMP, EMP_WHEN_DANGER, EmpFilter, FilterItem, GoalFilter as _, Risk};
+use crate::observation::{HISTORY, HistoryMap, ObservationLayout};
 
 fn robot() -> Arc<Robot> {
     Arc::new(Robot::load("../robots/emp27".as_ref()).unwrap())

@@ -4,8 +4,12 @@ use std::f64::consts::TAU;
 
 use emp_robot::Robot;
 
-use super::{FilterError, Parameters, Rule, remembered};
-use crate::controller::FilterItem;
+use super::{
+    error::FilterError,
+    goal_filter::FilterItem,
+    parameters::Parameters,
+    rule::{Rule, remembered},
+};
 
 /// Equal first-order sections in a row, by joint: no overshoot, and slow motion comes out
 /// `order · √(2^(1/order) − 1) / (2π cutoff)` seconds late.
@@ -20,8 +24,6 @@ pub(super) struct LowPass {
 }
 
 impl LowPass {
-    pub(super) const NAME: &'static str = "low-pass";
-
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let rate = robot.control_rate_hz();
         let cutoff = parameters.number("cutoff", 0.01..=0.5 * rate, " Hz")?;

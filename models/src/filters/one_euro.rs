@@ -4,8 +4,12 @@ use std::f64::consts::TAU;
 
 use emp_robot::Robot;
 
-use super::{FilterError, Parameters, Rule, remembered};
-use crate::controller::FilterItem;
+use super::{
+    error::FilterError,
+    goal_filter::FilterItem,
+    parameters::Parameters,
+    rule::{Rule, remembered},
+};
 
 /// A first-order low-pass by joint, whose cut-off rises with the joint's speed: little jitter at rest, little lag in motion.
 ///
@@ -20,8 +24,6 @@ pub(super) struct OneEuro {
 }
 
 impl OneEuro {
-    pub(super) const NAME: &'static str = "one-euro";
-
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let cutoff = parameters.number("cutoff", 0.01..=1000.0, " Hz")?;
         let beta = parameters.number("beta", 0.0..=1000.0, " Hz per rad/s")?;

@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, ops::RangeInclusive};
 
-use super::FilterError;
+use super::error::FilterError;
 
 /// A filter's name, and the parameters that nobody has asked for yet.
 pub(super) struct Parameters<'a> {

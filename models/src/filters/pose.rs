@@ -2,8 +2,7 @@
 
 use emp_robot::{Joint, Robot};
 
-use super::{FilterError, Parameters, Rule};
-use crate::controller::FilterItem;
+use super::{error::FilterError, goal_filter::FilterItem, parameters::Parameters, rule::Rule};
 
 /// Multiplies each goal's distance from the default pose by `factor`.
 pub(super) struct AmplitudeCut {
@@ -12,8 +11,6 @@ pub(super) struct AmplitudeCut {
 }
 
 impl AmplitudeCut {
-    pub(super) const NAME: &'static str = "amplitude-cut";
-
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let factor = parameters.number("factor", 0.0..=1.0, "")?;
         parameters.finish("factor")?;
@@ -51,8 +48,6 @@ enum Knee {
 }
 
 impl SoftKnee {
-    pub(super) const NAME: &'static str = "soft-knee";
-
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let slope = parameters.number("slope", 0.0..=1.0, "")?;
         let mut words = parameters.rest();

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use emp_robot::{Robot, SupportPolygon};
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
-use super::{FilterError, Parameters, Rule};
-use crate::{controller::FilterItem, observation::ObservationLayout};
+use super::{error::FilterError, goal_filter::FilterItem, parameters::Parameters, rule::Rule};
+use crate::observation::ObservationLayout;
 
 /// The margin without a parameter, as a share of the default pose's own.
 const USUAL_SHARE: f64 = 0.7;
@@ -30,8 +30,6 @@ pub(super) struct StaticClamp {
 }
 
 impl StaticClamp {
-    pub(super) const NAME: &'static str = "static-clamp";
-
     pub(super) fn new(
         parameters: &mut Parameters<'_>,
         robot: &Arc<Robot>,

@@ -161,11 +161,7 @@ proptest! {
 
 /// The filters that need no learning.
 fn rules() -> impl Iterator<Item = FilterDescription> {
-    let learnt = [
-        Controller::DECOUPLED,
-        EmpFilter::ALWAYS,
-        EmpFilter::WHEN_DANGER,
-    ];
+    let learnt = [DECOUPLED, EMP, EMP_WHEN_DANGER];
     LIST.into_iter()
         .filter(move |filter| !learnt.contains(&filter.name))
 }
@@ -173,9 +169,9 @@ fn rules() -> impl Iterator<Item = FilterDescription> {
 #[test]
 fn what_is_no_rule_is_no_filter_or_needs_weights() {
     let robot = &robots()[0];
-    let none = by_name(Controller::DECOUPLED, robot, None).unwrap();
+    let none = by_name(DECOUPLED, robot, None).unwrap();
     assert!(none.is_none());
-    for name in [EmpFilter::ALWAYS, EmpFilter::WHEN_DANGER] {
+    for name in [EMP, EMP_WHEN_DANGER] {
         let message = refused(name);
         assert!(message.contains("has no EMP weights"), "{message}");
     }

@@ -2,8 +2,12 @@
 
 use emp_robot::Robot;
 
-use super::{FilterError, Parameters, Rule, remembered};
-use crate::controller::FilterItem;
+use super::{
+    error::FilterError,
+    goal_filter::FilterItem,
+    parameters::Parameters,
+    rule::{Rule, remembered},
+};
 
 /// Moves each joint's goal toward the one asked for, by no more than a largest step a control period.
 ///
@@ -14,8 +18,6 @@ pub(super) struct VelocityLimit {
 }
 
 impl VelocityLimit {
-    pub(super) const NAME: &'static str = "velocity-limit";
-
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let limit = parameters.number("limit", 0.01..=1000.0, " rad/s")?;
         parameters.finish("limit")?;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use emp_models::{controller::Controller, retarget::Retargeter};
+use emp_models::{controller::Controller, filters::DECOUPLED, retarget::Retargeter};
 use emp_motion::Clip;
 use emp_proto::v1::{
     EpisodeFinished, EvaluateConfig, EvaluateRequest, EvaluateResponse, EvaluationPreparing,
@@ -268,7 +268,7 @@ fn kick(push: &Push) -> Kick {
 
 fn read_controller(name: &str, policy: &PolicyModel) -> Result<Controller, FieldError> {
     let name = match name {
-        "" => Controller::DECOUPLED,
+        "" => DECOUPLED,
         name => name,
     };
     Controller::by_name(name, policy.model.policy(), policy.model.emp())

@@ -4,10 +4,7 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use emp_models::{
-    controller::Controller,
-    emp::{Emp, EmpFilter},
-    policy::Policy,
-    retarget::Retargeter,
+    controller::Controller, emp::Emp, filters::EmpFilter, policy::Policy, retarget::Retargeter,
 };
 use emp_motion::skills;
 use emp_sim::{

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use emp_models::{
     ModelError,
-    controller::{FilterItem, GoalFilter},
+    filters::{FilterItem, GoalFilter},
 };
 use emp_robot::{Robot, RobotError};
 use emp_sim::evaluation::{ExecutedFrame, Observer};

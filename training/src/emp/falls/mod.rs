@@ -10,8 +10,9 @@ use std::{iter::Sum, sync::Arc};
 
 use anyhow::{Context as _, Result, ensure};
 use emp_models::{
-    controller::{Controller, GoalFilter},
-    emp::{DangerGate, Emp, EmpFilter},
+    controller::Controller,
+    emp::{DangerGate, Emp},
+    filters::{EmpFilter, GoalFilter},
     policy::Policy,
 };
 use emp_sim::{

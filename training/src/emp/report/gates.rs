@@ -3,10 +3,7 @@
 use std::sync::Arc;
 
 use anyhow::Result;
-use emp_models::{
-    controller::Controller,
-    emp::{DangerGate, EmpFilter},
-};
+use emp_models::{controller::Controller, emp::DangerGate, filters::EmpFilter};
 use emp_sim::{
     evaluation::{ExecutedFrame, Observer, Progress},
     metrics::EpisodeSums,

@@ -12,7 +12,8 @@ use std::sync::Arc;
 use anyhow::{Context as _, Result, ensure};
 use emp_models::{
     controller::Controller,
-    emp::{Emp, EmpFilter},
+    emp::Emp,
+    filters::{DECOUPLED, EmpFilter},
     policy::Policy,
 };
 use emp_sim::{
@@ -216,8 +217,8 @@ struct Contender {
 impl Contender {
     fn raw(run: &EmpRun<'_>) -> Self {
         Self {
-            name: Controller::DECOUPLED.to_owned(),
-            family: Controller::DECOUPLED.to_owned(),
+            name: DECOUPLED.to_owned(),
+            family: DECOUPLED.to_owned(),
             learned: false,
             controller: Controller::new(Arc::clone(run.policy), None),
         }

@@ -3,8 +3,9 @@ use std::path::Path;
 use candle_core::{DType, Device};
 use candle_nn::{VarBuilder, VarMap};
 use emp_models::{
-    controller::{ControllerOutput, Risk},
+    controller::ControllerOutput,
     emp::{DangerGate, EmpConfig, EmpNetwork, Output},
+    filters::Risk,
     mlp::Normalizer,
     observation::HistoryMap,
 };

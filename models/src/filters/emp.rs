@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
-use super::{DangerGate, Emp};
+use super::{
+    goal_filter::{FilterItem, GoalFilter, Risk},
+    names::{EMP, EMP_WHEN_DANGER},
+};
 use crate::{
     ModelError,
-    controller::{FilterItem, GoalFilter, Risk},
-    observation::ObservationLayout,
+    emp::{DangerGate, Emp},
 };
 
 /// Control periods in which the correction is faded in once there is danger.
@@ -24,11 +26,6 @@ pub struct EmpFilter {
 }
 
 impl EmpFilter {
-    /// The name of the controller that always filters.
-    pub const ALWAYS: &'static str = "emp";
-    /// The name of the controller that filters when there is danger.
-    pub const WHEN_DANGER: &'static str = "emp-when-danger";
-
     /// Filters every goal; danger is judged by the checkpoint's gate.
     pub fn always(emp: Arc<Emp>) -> Self {
         Self {
@@ -67,27 +64,9 @@ impl EmpFilter {
     }
 }
 
-impl DangerGate {
-    /// Whether there is danger: `regloss` is the EMP's, `frame` the newest of its stack.
-    fn is_passed(self, regloss: f32, frame: &[f32], layout: &ObservationLayout) -> bool {
-        match self {
-            Self::Regloss(limit) => regloss > limit,
-            Self::Tilt(limit) => {
-                let orientation = &frame[layout.orientation()];
-                let upright = orientation[0].cos() * orientation[1].cos();
-                upright < limit.cos()
-            }
-        }
-    }
-}
-
 impl GoalFilter for EmpFilter {
     fn name(&self) -> &str {
-        if self.always {
-            Self::ALWAYS
-        } else {
-            Self::WHEN_DANGER
-        }
+        if self.always { EMP } else { EMP_WHEN_DANGER }
     }
 
     fn filter(&self, batch: &mut [FilterItem<'_>]) -> Result<(), ModelError> {

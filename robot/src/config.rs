@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use crate::RobotError;
-use crate::robot::{KEY_NODE_NAMES, KEY_NODES};
+use crate::key_nodes::{KEY_NODE_NAMES, KEY_NODES};
 
 /// Allowed error of unit vectors and right angles in the file.
 const UNIT_TOLERANCE: f64 = 1e-6;

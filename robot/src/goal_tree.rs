@@ -3,7 +3,7 @@
 use mujoco_rs::prelude::*;
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
-use crate::robot::GoalNode;
+use crate::joint::GoalNode;
 
 /// The first `count` columns of a joint vector as a graph; `columns[joint id]` is a joint's column.
 pub(crate) fn build(

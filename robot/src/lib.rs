@@ -10,7 +10,10 @@
 
 mod config;
 mod error;
+mod foot;
 mod goal_tree;
+mod joint;
+mod key_nodes;
 mod kinematics;
 mod loader;
 mod mirror;
@@ -19,10 +22,10 @@ mod robot;
 mod support;
 
 pub use error::RobotError;
+pub use foot::Foot;
+pub use joint::{GoalNode, Joint};
+pub use key_nodes::{KEY_NODE_NAMES, KEY_NODES, KeyNodeSite};
 pub use kinematics::{FrameKinematics, Kinematics, OutputLayout, Real};
 pub use mirror::JointMirror;
-pub use robot::{
-    AddedMasses, Foot, GoalNode, Joint, KEY_NODE_NAMES, KEY_NODES, KeyNodeSite, LinkSphere, Robot,
-    robot_folders,
-};
+pub use robot::{AddedMasses, LinkSphere, Robot, robot_folders};
 pub use support::SupportPolygon;

@@ -5,9 +5,11 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::RobotError;
 use crate::config::{Config, JointConfig, WristConfig};
+use crate::foot::Foot;
+use crate::joint::Joint;
+use crate::key_nodes::{KEY_NODE_NAMES, KEY_NODES};
 use crate::kinematics::Attached;
 use crate::model::Files;
-use crate::robot::{Foot, Joint, KEY_NODE_NAMES, KEY_NODES};
 
 /// The joints of `robot.toml`, found in the model.
 pub(crate) struct Joints {

@@ -6,79 +6,16 @@ use mujoco_rs::prelude::*;
 use nalgebra::Vector3;
 
 use crate::config::{Config, FootConfig, SphereConfig};
+use crate::foot::Foot;
+use crate::joint::{GoalNode, Joint};
+use crate::key_nodes::{KEY_NODE_NAMES, KeyNodeSite};
 use crate::kinematics::Kinematics;
 use crate::loader::{self, Found, Joints};
 use crate::model::{self, Files, Shapes};
 use crate::{RobotError, goal_tree};
 
-/// Number of key nodes.
-pub const KEY_NODES: usize = 8;
-
-/// Names of the key nodes, in the order in which they stand everywhere.
-pub const KEY_NODE_NAMES: [&str; KEY_NODES] = [
-    "waist",
-    "torso",
-    "left_shoulder",
-    "right_shoulder",
-    "left_elbow",
-    "right_elbow",
-    "left_wrist",
-    "right_wrist",
-];
-
 /// The file in a robot's folder that describes it.
 const CONFIG_FILE: &str = "robot.toml";
-
-/// A hinge joint with its position servo: torque = kp (target − q) − kd q̇, at most `torque_limit` either way.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Joint {
-    /// Name of the joint, and of its actuator, in the model.
-    pub name: String,
-    /// Lower and upper limit, rad.
-    pub range: [f64; 2],
-    /// Stiffness of the servo, N·m/rad.
-    pub kp: f64,
-    /// Damping of the servo, N·m·s/rad.
-    pub kd: f64,
-    /// Largest torque, N·m.
-    pub torque_limit: f64,
-    /// Largest speed, rad/s.
-    pub velocity_limit: f64,
-    /// Inertia of the rotor seen at the joint, kg·m².
-    pub armature: f64,
-    /// Passive damping of the joint, N·m·s/rad.
-    pub damping: f64,
-    /// Angle in the default pose, rad.
-    pub default: f64,
-    /// Index of the angle in MuJoCo's `qpos`.
-    pub qpos_address: usize,
-    /// Index of the speed in MuJoCo's `qvel`.
-    pub dof_address: usize,
-}
-
-/// A goal joint as a node of the robot's joint graph.
-#[derive(Clone, Debug, PartialEq)]
-pub struct GoalNode {
-    /// Index of the goal joint that carries this one; none if the base does.
-    pub parent: Option<usize>,
-    /// Origin of the joint in the frame of its parent joint (of the base without one), all joints at zero, metres.
-    pub origin_xyz: [f64; 3],
-    /// Orientation of that frame: roll, pitch, yaw about fixed axes x, y, z, rad.
-    pub origin_rpy: [f64; 3],
-    /// Unit axis of the joint in its own frame.
-    pub axis: [f64; 3],
-}
-
-/// Where a key node sits.
-#[derive(Clone, Debug, PartialEq)]
-pub struct KeyNodeSite {
-    /// One of [`KEY_NODE_NAMES`].
-    pub name: &'static str,
-    /// Body that carries it.
-    pub body: String,
-    /// Position in the body's frame, metres.
-    pub offset: [f64; 3],
-}
 
 /// A link as a sphere, for the collision loss of the EMP.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,19 +30,6 @@ pub struct LinkSphere {
     pub radius: f64,
 }
 
-/// A foot: the spheres it touches the floor with.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Foot {
-    /// Body that carries it; its z axis is the sole's normal.
-    pub body: String,
-    /// Radius of the spheres, metres.
-    pub radius: f64,
-    /// Centres in the body's frame, metres.
-    pub centers: Vec<[f64; 3]>,
-    /// Names of the spheres' geoms in the model, in the order of `centers`.
-    pub geoms: Vec<String>,
-}
-
 /// Ranges of masses that are added to the robot, kg: the paper's for a robot of 60 kg, scaled to this one's mass.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AddedMasses {
@@ -115,39 +39,6 @@ pub struct AddedMasses {
     pub hand: [f64; 2],
     /// To each hand, in tests.
     pub test_hand: [f64; 2],
-}
-
-impl Foot {
-    fn new(config: &FootConfig) -> Self {
-        Self {
-            body: config.body.clone(),
-            radius: config.radius,
-            centers: config.centers.clone(),
-            geoms: (0..config.centers.len())
-                .map(|i| model::foot_geom(&config.body, i))
-                .collect(),
-        }
-    }
-
-    /// Centre of the sole in the body's frame: in x and y the middle of what the spheres span, in z their lowest
-    /// point.
-    pub fn sole_center(&self) -> [f64; 3] {
-        let fold = |axis: usize, start: f64, pick: fn(f64, f64) -> f64| {
-            self.centers
-                .iter()
-                .map(|center| center[axis])
-                .fold(start, pick)
-        };
-        let [lower, upper] = [
-            [0, 1, 2].map(|axis| fold(axis, f64::INFINITY, f64::min)),
-            [0, 1, 2].map(|axis| fold(axis, f64::NEG_INFINITY, f64::max)),
-        ];
-        [
-            f64::midpoint(lower[0], upper[0]),
-            f64::midpoint(lower[1], upper[1]),
-            lower[2] - self.radius,
-        ]
-    }
 }
 
 /// A robot, loaded and checked. Immutable; share it in an [`Arc`](std::sync::Arc).
@@ -183,7 +74,7 @@ impl Robot {
             model: &model_file,
         };
         let model = model::compile(&files, &config, Shapes::Physical)?;
-        let feet = config.contacts.feet().map(|(_, foot)| Foot::new(foot));
+        let feet = config.contacts.feet().map(|(_, config)| foot(config));
         let Found {
             base,
             joints,
@@ -389,6 +280,22 @@ pub fn robot_folders(dir: &Path) -> Result<Vec<PathBuf>, RobotError> {
     }
     folders.sort();
     Ok(folders)
+}
+
+fn foot(config: &FootConfig) -> Foot {
+    let FootConfig {
+        body,
+        radius,
+        centers,
+    } = config;
+    Foot {
+        body: body.clone(),
+        radius: *radius,
+        centers: centers.clone(),
+        geoms: (0..centers.len())
+            .map(|i| model::foot_geom(body, i))
+            .collect(),
+    }
 }
 
 fn key_nodes(config: &Config) -> Vec<KeyNodeSite> {

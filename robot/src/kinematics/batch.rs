@@ -1,7 +1,7 @@
 //! Forward and reverse pass over a few poses at once.
 
 use super::lane::{LANES, Lane, Vec3, cross, difference, dot, sum};
-use super::real::Real;
+use super::scalar::Scalar;
 use super::tree::{Frame, Node, Point, Tree, Turn};
 
 /// Where a node is, in the base's frame: the columns of its rotation, and its origin.
@@ -11,7 +11,7 @@ pub(super) struct Pose<T> {
     origin: Vec3<T>,
 }
 
-impl<T: Real> Pose<T> {
+impl<T: Scalar> Pose<T> {
     pub(super) fn base() -> Self {
         let (zero, one) = (Lane::ZERO, Lane::ONE);
         Self {
@@ -90,7 +90,7 @@ impl<T: Real> Pose<T> {
 
 /// Turns the column pair (a, b) in its plane: a right-handed rotation about the third column.
 #[inline(always)]
-fn mix<T: Real>(a: Vec3<T>, b: Vec3<T>, sine: Lane<T>, cosine: Lane<T>) -> (Vec3<T>, Vec3<T>) {
+fn mix<T: Scalar>(a: Vec3<T>, b: Vec3<T>, sine: Lane<T>, cosine: Lane<T>) -> (Vec3<T>, Vec3<T>) {
     let row = |i: usize| (cosine * a[i] + sine * b[i], cosine * b[i] - sine * a[i]);
     let [(a0, b0), (a1, b1), (a2, b2)] = [row(0), row(1), row(2)];
     ([a0, a1, a2], [b0, b1, b2])
@@ -98,7 +98,7 @@ fn mix<T: Real>(a: Vec3<T>, b: Vec3<T>, sine: Lane<T>, cosine: Lane<T>) -> (Vec3
 
 /// Reads column `column` of up to [`LANES`] rows of `width`; missing rows are zero.
 #[inline(always)]
-fn gather<T: Real>(rows: &[T], width: usize, column: usize) -> Lane<T> {
+fn gather<T: Scalar>(rows: &[T], width: usize, column: usize) -> Lane<T> {
     let mut lane = Lane::ZERO;
     for (slot, value) in lane.0.iter_mut().zip(rows[column..].iter().step_by(width)) {
         *slot = *value;
@@ -108,7 +108,7 @@ fn gather<T: Real>(rows: &[T], width: usize, column: usize) -> Lane<T> {
 
 /// Writes columns `column`, … of up to [`LANES`] rows of `width`.
 #[inline(always)]
-fn scatter<T: Real, const N: usize>(
+fn scatter<T: Scalar, const N: usize>(
     rows: &mut [T],
     width: usize,
     column: usize,
@@ -121,7 +121,7 @@ fn scatter<T: Real, const N: usize>(
     }
 }
 
-impl<T: Real> Tree<T> {
+impl<T: Scalar> Tree<T> {
     /// Width of an output row: key nodes and link centres, two wrist rotations, centre of mass, foot support.
     pub(super) fn width(&self) -> usize {
         3 * self.points.len() + 2 * 9 + 3 + 3
@@ -251,7 +251,7 @@ impl<T: Real> Tree<T> {
 
 /// Torque of a gradient on a row-major rotation: Σ over its columns of column × gradient.
 #[inline(always)]
-fn wrist_torque<T: Real>(
+fn wrist_torque<T: Scalar>(
     wrist: &Frame<T>,
     pose: &Pose<T>,
     gradient: impl Fn(usize) -> Lane<T>,
@@ -272,7 +272,7 @@ pub(super) struct Wrench<T> {
     torque: Vec3<T>,
 }
 
-impl<T: Real> Wrench<T> {
+impl<T: Scalar> Wrench<T> {
     pub(super) const ZERO: Self = Self {
         force: [Lane::ZERO; 3],
         torque: [Lane::ZERO; 3],

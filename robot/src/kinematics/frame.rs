@@ -2,9 +2,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::Kinematics;
 use super::tree::{Tree, Turn};
-use crate::robot::KEY_NODES;
+use crate::key_nodes::KEY_NODES;
 
 /// Key nodes, wrists and joint axes of one pose: what inverse kinematics over the goal joints needs.
 ///
@@ -40,9 +39,9 @@ pub struct FrameKinematics {
 }
 
 impl FrameKinematics {
-    pub(super) fn new(kinematics: &Kinematics) -> Self {
-        let tree = kinematics.double.clone();
-        let joints = kinematics.goal_joints;
+    /// `tree` of a robot whose first `joints` joints are goal joints.
+    pub(super) fn new(tree: &Tree<f64>, joints: usize) -> Self {
+        let tree = tree.clone();
         let moved = (1..tree.nodes.len())
             .filter(|&node| tree.nodes[node].joint < joints)
             .collect();

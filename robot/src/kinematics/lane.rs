@@ -3,7 +3,7 @@
 use std::array;
 use std::ops::{Add, AddAssign, Mul, Neg, Sub};
 
-use super::real::Real;
+use super::scalar::Scalar;
 
 /// Poses that are worked on at once.
 pub(super) const LANES: usize = 8;
@@ -15,7 +15,7 @@ pub(super) struct Lane<T>(pub(super) [T; LANES]);
 /// A vector of each pose.
 pub(super) type Vec3<T> = [Lane<T>; 3];
 
-impl<T: Real> Lane<T> {
+impl<T: Scalar> Lane<T> {
     pub(super) const ZERO: Self = Self([T::ZERO; LANES]);
     pub(super) const ONE: Self = Self([T::ONE; LANES]);
 
@@ -30,7 +30,7 @@ impl<T: Real> Lane<T> {
     }
 }
 
-impl<T: Real> Add for Lane<T> {
+impl<T: Scalar> Add for Lane<T> {
     type Output = Self;
 
     #[inline(always)]
@@ -39,14 +39,14 @@ impl<T: Real> Add for Lane<T> {
     }
 }
 
-impl<T: Real> AddAssign for Lane<T> {
+impl<T: Scalar> AddAssign for Lane<T> {
     #[inline(always)]
     fn add_assign(&mut self, other: Self) {
         *self = *self + other;
     }
 }
 
-impl<T: Real> Sub for Lane<T> {
+impl<T: Scalar> Sub for Lane<T> {
     type Output = Self;
 
     #[inline(always)]
@@ -55,7 +55,7 @@ impl<T: Real> Sub for Lane<T> {
     }
 }
 
-impl<T: Real> Mul for Lane<T> {
+impl<T: Scalar> Mul for Lane<T> {
     type Output = Self;
 
     #[inline(always)]
@@ -65,7 +65,7 @@ impl<T: Real> Mul for Lane<T> {
 }
 
 /// By a number that is the same in all poses.
-impl<T: Real> Mul<T> for Lane<T> {
+impl<T: Scalar> Mul<T> for Lane<T> {
     type Output = Self;
 
     #[inline(always)]
@@ -74,7 +74,7 @@ impl<T: Real> Mul<T> for Lane<T> {
     }
 }
 
-impl<T: Real> Neg for Lane<T> {
+impl<T: Scalar> Neg for Lane<T> {
     type Output = Self;
 
     #[inline(always)]
@@ -85,19 +85,19 @@ impl<T: Real> Neg for Lane<T> {
 
 /// a + b.
 #[inline(always)]
-pub(super) fn sum<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+pub(super) fn sum<T: Scalar>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
 }
 
 /// a − b.
 #[inline(always)]
-pub(super) fn difference<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+pub(super) fn difference<T: Scalar>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
 /// a × b.
 #[inline(always)]
-pub(super) fn cross<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+pub(super) fn cross<T: Scalar>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
     [
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -107,6 +107,6 @@ pub(super) fn cross<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
 
 /// a · b.
 #[inline(always)]
-pub(super) fn dot<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Lane<T> {
+pub(super) fn dot<T: Scalar>(a: Vec3<T>, b: Vec3<T>) -> Lane<T> {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }

@@ -6,7 +6,8 @@
 mod batch;
 mod frame;
 mod lane;
-mod real;
+mod precision;
+mod scalar;
 mod tree;
 
 use std::ops::Range;
@@ -15,11 +16,12 @@ use mujoco_rs::prelude::*;
 use nalgebra::Vector3;
 
 pub use frame::FrameKinematics;
-pub use real::Real;
+pub use precision::Real;
 pub(crate) use tree::Attached;
 
-use crate::robot::KEY_NODES;
+use crate::key_nodes::KEY_NODES;
 use batch::{Pose, Wrench, block};
+use precision::Trees;
 use tree::Tree;
 
 /// Where each output stands in a row of [`Kinematics::forward`].
@@ -66,8 +68,7 @@ impl OutputLayout {
 /// the calling thread; a pose's result does not depend on the others in its batch.
 #[derive(Clone, Debug)]
 pub struct Kinematics {
-    double: Tree<f64>,
-    single: Tree<f32>,
+    trees: Trees,
     layout: OutputLayout,
     goal_joints: usize,
 }
@@ -85,8 +86,10 @@ impl Kinematics {
         let double = Tree::new(model, base, columns, dof, attached);
         let layout = OutputLayout::new(attached.links.len());
         Self {
-            single: double.cast(),
-            double,
+            trees: Trees {
+                single: double.cast(),
+                double,
+            },
             layout,
             goal_joints,
         }
@@ -94,7 +97,7 @@ impl Kinematics {
 
     /// Length of a joint vector.
     pub fn dof(&self) -> usize {
-        self.double.dof
+        self.trees.double.dof
     }
 
     /// Numbers in one output row: [`OutputLayout::width`].
@@ -115,7 +118,7 @@ impl Kinematics {
     pub fn forward<T: Real>(&self, q: &[T], out: &mut [T]) {
         let (dof, width) = (self.dof(), self.output_width());
         self.check_rows(q.len(), out.len());
-        let tree = T::tree(self);
+        let tree = T::tree(&self.trees);
         let mut poses = vec![Pose::base(); tree.nodes.len()];
         for (q, out) in q.chunks(block(dof)).zip(out.chunks_mut(block(width))) {
             tree.poses(q, &mut poses);
@@ -132,7 +135,7 @@ impl Kinematics {
         let (dof, width) = (self.dof(), self.output_width());
         self.check_rows(q.len(), grad_out.len());
         assert_eq!(q.len(), grad_q.len(), "grad_q has to be as long as q");
-        let tree = T::tree(self);
+        let tree = T::tree(&self.trees);
         let mut poses = vec![Pose::base(); tree.nodes.len()];
         let mut wrenches = vec![Wrench::ZERO; tree.nodes.len()];
         let rows = q
@@ -151,9 +154,9 @@ impl Kinematics {
     /// If `q` is not one angle for each joint.
     pub fn foot_contacts(&self, q: &[f64]) -> Vec<Vector3<f64>> {
         assert_eq!(q.len(), self.dof(), "one angle for each joint");
-        let mut poses = vec![Pose::base(); self.double.nodes.len()];
-        self.double.poses(q, &mut poses);
-        let contacts = self.double.foot_contacts.iter();
+        let mut poses = vec![Pose::base(); self.trees.double.nodes.len()];
+        self.trees.double.poses(q, &mut poses);
+        let contacts = self.trees.double.foot_contacts.iter();
         contacts
             .map(|contact| poses[contact.node].point(contact.offset))
             .map(|point| point.map(|lane| lane.0[0]).into())
@@ -162,8 +165,8 @@ impl Kinematics {
 
     /// Whether a goal joint moves the link sphere with this index.
     pub fn goals_move(&self, link: usize) -> bool {
-        let nodes = &self.double.nodes;
-        let mut node = self.double.points[KEY_NODES + link].node;
+        let nodes = &self.trees.double.nodes;
+        let mut node = self.trees.double.points[KEY_NODES + link].node;
         while node != 0 {
             if nodes[node].joint < self.goal_joints {
                 return true;
@@ -175,7 +178,7 @@ impl Kinematics {
 
     /// A state for following one pose at a time, as inverse kinematics does; every joint at zero.
     pub fn frame(&self) -> FrameKinematics {
-        FrameKinematics::new(self)
+        FrameKinematics::new(&self.trees.double, self.goal_joints)
     }
 
     fn check_rows(&self, q: usize, out: usize) {

@@ -3,7 +3,7 @@
 use mujoco_rs::prelude::*;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
-use super::real::Real;
+use super::scalar::Scalar;
 
 /// An axis closer than this to x, y or z counts as that axis.
 const AXIS_TOLERANCE: f64 = 1e-12;
@@ -132,7 +132,7 @@ impl Tree<f64> {
     }
 
     /// The same tree in another precision.
-    pub(super) fn cast<T: Real>(&self) -> Tree<T> {
+    pub(super) fn cast<T: Scalar>(&self) -> Tree<T> {
         Tree {
             dof: self.dof,
             nodes: self.nodes.iter().map(Node::cast).collect(),
@@ -254,7 +254,7 @@ impl Node<f64> {
         }
     }
 
-    fn cast<T: Real>(&self) -> Node<T> {
+    fn cast<T: Scalar>(&self) -> Node<T> {
         Node {
             parent: self.parent,
             joint: self.joint,
@@ -286,7 +286,7 @@ impl Turn<f64> {
         }
     }
 
-    fn cast<T: Real>(&self) -> Turn<T> {
+    fn cast<T: Scalar>(&self) -> Turn<T> {
         match self {
             Self::None => Turn::None,
             Self::X => Turn::X,
@@ -308,7 +308,7 @@ impl Turn<f64> {
 }
 
 impl Point<f64> {
-    fn cast<T: Real>(&self) -> Point<T> {
+    fn cast<T: Scalar>(&self) -> Point<T> {
         Point {
             node: self.node,
             offset: self.offset.map(T::from_f64),
@@ -317,7 +317,7 @@ impl Point<f64> {
 }
 
 impl Frame<f64> {
-    fn cast<T: Real>(&self) -> Frame<T> {
+    fn cast<T: Scalar>(&self) -> Frame<T> {
         Frame {
             node: self.node,
             axes: self.axes.map(T::from_f64),

@@ -2,16 +2,7 @@
 
 use std::ops::{Add, Mul, Neg, Sub};
 
-use super::Kinematics;
-use super::tree::Tree;
-
-/// `f32` or `f64`. Sealed: nothing else implements it.
-pub trait Real: Scalar {}
-
-impl Real for f32 {}
-impl Real for f64 {}
-
-/// What the kinematics needs of a number; out of reach from outside, which seals [`Real`].
+/// What the kinematics needs of a number.
 pub trait Scalar:
     Copy
     + Send
@@ -30,8 +21,6 @@ pub trait Scalar:
     fn from_f64(value: f64) -> Self;
     /// Sine and cosine of an angle.
     fn sin_cos(self) -> (Self, Self);
-    /// The tree with its constants in this type.
-    fn tree(kinematics: &Kinematics) -> &Tree<Self>;
 }
 
 impl Scalar for f32 {
@@ -45,10 +34,6 @@ impl Scalar for f32 {
     fn sin_cos(self) -> (Self, Self) {
         Self::sin_cos(self)
     }
-
-    fn tree(kinematics: &Kinematics) -> &Tree<Self> {
-        &kinematics.single
-    }
 }
 
 impl Scalar for f64 {
@@ -61,9 +46,5 @@ impl Scalar for f64 {
 
     fn sin_cos(self) -> (Self, Self) {
         Self::sin_cos(self)
-    }
-
-    fn tree(kinematics: &Kinematics) -> &Tree<Self> {
-        &kinematics.double
     }
 }

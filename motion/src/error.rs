@@ -2,8 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::KeyNode;
-
 /// Why one pose was refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum FrameError {
@@ -37,15 +35,6 @@ pub enum FrameError {
         /// `left` or `right`.
         side: &'static str,
     },
-}
-
-impl FrameError {
-    pub(crate) fn empty_bone(parent: KeyNode, node: KeyNode) -> Self {
-        Self::EmptyBone {
-            parent: parent.name(),
-            node: node.name(),
-        }
-    }
 }
 
 /// Why a motion file could not be read or written.

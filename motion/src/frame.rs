@@ -100,6 +100,15 @@ impl KeyNode {
     }
 }
 
+impl FrameError {
+    pub(crate) fn empty_bone(parent: KeyNode, node: KeyNode) -> Self {
+        Self::EmptyBone {
+            parent: parent.name(),
+            node: node.name(),
+        }
+    }
+}
+
 /// A side of the body; as an index, left is 0 and right is 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(usize)]

@@ -8,8 +8,8 @@ use nalgebra::Vector3;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::Skill;
 use super::body::{ArmPose, Body, Pose};
+use super::skill::Skill;
 use super::timeline::Timeline;
 use crate::Side;
 

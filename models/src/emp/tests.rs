@@ -2,8 +2,8 @@ use candle_core::Tensor;
 use candle_nn::VarMap;
 
 use super::*;
-use crate::filters::{EMP, EMP_WHEN_DANGER, EmpFilter, FilterItem, GoalFilter as _, Risk};
-use crate::observation::{HISTORY, HistoryMap, ObservationLayout};
+use crate::filters::{EmpFilter, FilterItem, GoalFilter as _, Risk};
+use crate::observation::{HISTORY, HistoryMap};
 
 fn robot() -> Arc<Robot> {
     Arc::new(Robot::load("../robots/emp27".as_ref()).unwrap())

@@ -3,7 +3,7 @@
 use pulp::{Arch, NullaryFnOnce};
 
 use super::{
-    Block, WIDTH,
+    block::{Block, WIDTH},
     machine::{Machine, Portable},
 };
 use crate::activation;

@@ -8,6 +8,7 @@
 //! whatever rows stand beside it and however many threads share the work; and processors with a fused multiply-add agree
 //! with each other.
 
+mod block;
 mod kernel;
 mod machine;
 #[cfg(test)]
@@ -19,13 +20,8 @@ use candle_core::bail;
 use half::f16;
 
 use crate::linear;
+use block::{Block, WIDTH};
 use kernel::{Panels, Weights};
-
-/// Outputs of a panel, and inputs of a block of activations.
-const WIDTH: usize = 32;
-
-/// As many numbers as a panel has outputs.
-type Block<T> = [T; WIDTH];
 
 /// How weights are stored. Sums are f32 either way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -12,7 +12,6 @@ use candle_core::{DType, Device};
 use candle_nn::VarBuilder;
 use emp_motion::KeyNodeFrame;
 use emp_robot::Robot;
-use nalgebra::Vector3;
 
 pub use self::{
     clips::{GoalRows, predict_clip, retarget_clips},
@@ -195,9 +194,4 @@ fn refine(
         }
     }
     solver.minimise(target, angles, Effort::REFINE);
-}
-
-/// Angle between two unit vectors, radians; exact near 0 and π.
-pub(crate) fn angle_between(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
-    2.0 * (a - b).norm().atan2((a + b).norm())
 }

@@ -8,10 +8,7 @@ use emp_motion::KeyNode;
 use emp_robot::{FrameKinematics, Robot};
 use nalgebra::{DMatrix, DVector, Vector3};
 
-use super::{
-    angle_between,
-    features::{BONES, Target},
-};
+use super::features::{BONES, Target};
 
 /// Weights of the objective's terms.
 pub mod weights {
@@ -365,4 +362,9 @@ impl Terms<'_> {
 /// The part of `change` that turns the unit vector `direction`.
 fn turn_of(direction: &Vector3<f64>, change: &Vector3<f64>) -> Vector3<f64> {
     change - direction * direction.dot(change)
+}
+
+/// Angle between two unit vectors, radians; exact near 0 and π.
+fn angle_between(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
+    2.0 * (a - b).norm().atan2((a + b).norm())
 }

@@ -6,9 +6,10 @@ use emp_models::controller::Controller;
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::{Evaluation, EvaluationSettings, Kick, Progress, evaluate};
+use crate::evaluation::{Evaluation, EvaluationSettings, Progress, evaluate};
 use crate::goals::GoalClip;
 use crate::metrics::{Interval, Metrics};
+use crate::pushes::Kick;
 use crate::{Pool, SimError};
 
 /// Scales of amplitude and speed.

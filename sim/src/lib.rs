@@ -37,7 +37,8 @@ pub mod ladder;
 pub mod metrics;
 mod physics;
 mod pool;
-mod pushes;
+pub mod pushes;
+mod ranges;
 mod skeleton;
 pub mod suite;
 #[cfg(test)]

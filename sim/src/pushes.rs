@@ -8,8 +8,38 @@ use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
 use crate::Body;
-use crate::environment::Push;
-use crate::evaluation::Kick;
+use crate::ranges::within;
+
+/// Pushes of the base: jumps of its velocity.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Push {
+    /// Time between two pushes, seconds; the time of an episode's first is drawn.
+    pub interval: f64,
+    /// Largest change of the horizontal velocity on each axis, m/s.
+    pub linear: f64,
+    /// Largest change of the angular velocity about each axis, rad/s.
+    pub angular: f64,
+}
+
+impl Push {
+    /// Draws the jumps of one push: of the linear velocity (world frame, m/s) and of the angular one (base frame, rad/s).
+    fn draw(&self, rng: &mut impl Rng) -> [Vector3<f64>; 2] {
+        let mut draw = |limit: f64| within(Some([-limit, limit]), 0.0, rng);
+        let linear = Vector3::new(draw(self.linear), draw(self.linear), 0.0);
+        [linear, Vector3::from_fn(|_, _| draw(self.angular))]
+    }
+}
+
+/// Pushes of known speed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Kick {
+    /// Speed that a push adds to the base, in a random horizontal direction, m/s.
+    pub speed: f64,
+    /// Time between two pushes, seconds; the time of an episode's first is drawn.
+    pub interval: f64,
+}
 
 /// What pushes an episode has.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

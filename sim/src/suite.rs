@@ -6,7 +6,8 @@
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::{Conditions, EvaluationSettings, Kick};
+use crate::evaluation::{Conditions, EvaluationSettings};
+use crate::pushes::Kick;
 
 /// Amplitudes of goals that reach farther than in training, and farther still.
 const WIDE: f64 = 1.5;

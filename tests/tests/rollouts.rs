@@ -20,6 +20,7 @@ use emp_sim::{
     evaluation::{self, EvaluationSettings},
     goals::{GoalClip, GoalLibrary, Source},
     metrics::Interval,
+    pushes,
 };
 use emp_tests::{
     TestServer, emp27, fake, policy,
@@ -199,7 +200,7 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
     let settings = EvaluationSettings {
         seed: 7,
         amplitude: 1.2,
-        push: Some(evaluation::Kick {
+        push: Some(pushes::Kick {
             speed: 0.4,
             interval: 5.0,
         }),

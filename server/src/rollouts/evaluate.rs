@@ -12,8 +12,9 @@ use emp_proto::v1::{
 use emp_robot::Robot;
 use emp_sim::{
     SimError,
-    evaluation::{Conditions, EpisodeResult, EvaluationSettings, Kick, Progress, evaluate},
+    evaluation::{Conditions, EpisodeResult, EvaluationSettings, Progress, evaluate},
     goals::{GoalClip, Source},
+    pushes::Kick,
 };
 use tonic::Streaming;
 

@@ -1,6 +1,5 @@
 //! One training environment.
 
-use std::fmt;
 use std::sync::Arc;
 
 use emp_robot::Robot;
@@ -8,36 +7,13 @@ use rand::{Rng as _, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::end_reason::EndReason;
 use super::rewards::Outcome;
 use super::subject::{Conditions, Kind, Subject};
 use super::{EnvironmentConfig, REWARD_TERMS, Randomization};
 use crate::goals::{GoalLibrary, GoalStream};
 use crate::pushes::Pushes;
-use crate::{Divergence, Reading, Stage};
-
-/// Why an episode ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub enum EndReason {
-    /// The base tilted too far.
-    Tilted,
-    /// The base came too low.
-    Sank,
-    /// The episode reached its full length.
-    TimedOut,
-    /// The simulation diverged.
-    Diverged(Divergence),
-}
-
-impl fmt::Display for EndReason {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Tilted => f.write_str("the base tilted too far"),
-            Self::Sank => f.write_str("the base came too low"),
-            Self::TimedOut => f.write_str("the episode reached its full length"),
-            Self::Diverged(divergence) => write!(f, "the simulation diverged: {divergence}"),
-        }
-    }
-}
+use crate::{Reading, Stage};
 
 /// What all environments share.
 #[derive(Debug)]

@@ -5,6 +5,7 @@
 //! the actions alone, not on the number of threads.
 
 mod config;
+mod end_reason;
 mod episode;
 mod privileged;
 mod randomization;
@@ -15,10 +16,10 @@ mod tests;
 mod vec;
 
 pub use config::EnvironmentConfig;
-pub use episode::EndReason;
+pub use end_reason::EndReason;
 pub use privileged::PrivilegedLayout;
-pub use randomization::{Hang, MassRange, Push, Randomization};
-pub(crate) use randomization::{check_range, leg_targets, within};
+pub(crate) use randomization::leg_targets;
+pub use randomization::{Hang, MassRange, Randomization};
 pub use rewards::{REWARD_NAMES, REWARD_TERMS, RewardWeights};
 pub(crate) use subject::{Conditions, Kind, Subject};
 pub use vec::{Step, VecEnvironment};

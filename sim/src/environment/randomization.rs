@@ -1,10 +1,11 @@
 //! Domain randomisation (paper, table "Domain Randomization").
 
 use emp_robot::Robot;
-use nalgebra::Vector3;
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
+use crate::pushes::Push;
+use crate::ranges::{check_range, within};
 use crate::{BodyParameters, SimError};
 
 /// A range of masses to add.
@@ -26,27 +27,6 @@ impl MassRange {
             Self::Off => None,
             Self::Kilograms(range) => Some(range),
         }
-    }
-}
-
-/// Pushes of the base: jumps of its velocity.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Push {
-    /// Time between two pushes, seconds; the time of an episode's first is drawn.
-    pub interval: f64,
-    /// Largest change of the horizontal velocity on each axis, m/s.
-    pub linear: f64,
-    /// Largest change of the angular velocity about each axis, rad/s.
-    pub angular: f64,
-}
-
-impl Push {
-    /// Draws the jumps of one push: of the linear velocity (world frame, m/s) and of the angular one (base frame, rad/s).
-    pub(crate) fn draw(&self, rng: &mut impl Rng) -> [Vector3<f64>; 2] {
-        let mut draw = |limit: f64| within(Some([-limit, limit]), 0.0, rng);
-        let linear = Vector3::new(draw(self.linear), draw(self.linear), 0.0);
-        [linear, Vector3::from_fn(|_, _| draw(self.angular))]
     }
 }
 
@@ -290,30 +270,6 @@ impl Randomization {
         }
         Ok(())
     }
-}
-
-/// Refuses a setting that is no range from low to high within these bounds.
-pub(crate) fn check_range(
-    name: &str,
-    [low, high]: [f64; 2],
-    least: f64,
-    most: f64,
-) -> Result<(), SimError> {
-    // Comparisons with NaN are false.
-    if least <= low && low <= high && high <= most {
-        return Ok(());
-    }
-    Err(SimError::Setting {
-        name: name.to_owned(),
-        expected: format!("a range from low to high within {least:e} and {most:e}"),
-        found: format!("{low} to {high}"),
-    })
-}
-
-/// A number from `range`, or `nominal` where there is none; draws one from `rng` either way.
-pub(crate) fn within(range: Option<[f64; 2]>, nominal: f64, rng: &mut impl Rng) -> f64 {
-    let share: f64 = rng.random();
-    range.map_or(nominal, |[low, high]| low + share * (high - low))
 }
 
 /// Leg targets (rad, inside the joints' ranges) of an action (policy units), each number of it times a factor from `noise`.

@@ -8,9 +8,10 @@ use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
 use super::privileged::{AHEAD, PrivilegedState};
-use super::randomization::{leg_targets, within};
+use super::randomization::leg_targets;
 use super::{PrivilegedLayout, Randomization};
 use crate::pushes::{PushClock, Pushes};
+use crate::ranges::within;
 use crate::{Body, BodyParameters, Stage, Start, Targets};
 
 /// Acceleration of gravity that turns the robot's mass into its weight, m/s².

@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::episode::Setting;
 use super::rewards::Outcome;
 use super::*;
+use crate::pushes::Push;
 use crate::testing::{emp27, for_each_robot, goal_library};
 use crate::{BodyParameters, Divergence, FootReading, Pool, Priority, Reading};
 

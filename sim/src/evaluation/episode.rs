@@ -10,10 +10,11 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::observer::ExecutedFrame;
-use crate::environment::{EndReason, EnvironmentConfig, Randomization, leg_targets, within};
+use crate::environment::{EndReason, EnvironmentConfig, Randomization, leg_targets};
 use crate::goals::{GoalClip, Source};
 use crate::metrics::{EpisodeSums, Frame};
 use crate::pushes::{PushClock, Pushes};
+use crate::ranges::within;
 use crate::{Body, Stage, Start, Targets};
 
 /// What all episodes of an evaluation share.

@@ -20,7 +20,7 @@ use serde::Serialize;
 
 pub use episode::EpisodeResult;
 pub use observer::{ExecutedFrame, Observer};
-pub use settings::{Conditions, EvaluationSettings, Kick};
+pub use settings::{Conditions, EvaluationSettings};
 
 use crate::environment::EnvironmentConfig;
 use crate::goals::{GoalClip, GoalStatistics, Source};

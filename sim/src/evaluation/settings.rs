@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::SimError;
 use crate::environment::{MassRange, Randomization};
-use crate::pushes::Pushes;
+use crate::pushes::{Kick, Pushes};
 
 /// How much the simulated robots differ from the model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,16 +16,6 @@ pub enum Conditions {
     Nominal,
     /// Every row of the paper's table of domain randomisation, pushes too.
     Full,
-}
-
-/// Pushes of known speed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Kick {
-    /// Speed that a push adds to the base, in a random horizontal direction, m/s.
-    pub speed: f64,
-    /// Time between two pushes, seconds; the time of an episode's first is drawn.
-    pub interval: f64,
 }
 
 /// Conditions of an evaluation; the default is the paper's test. All that is random in an episode follows from the seed and

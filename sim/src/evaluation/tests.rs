@@ -6,6 +6,7 @@ use emp_robot::Robot;
 
 use super::*;
 use crate::Priority;
+use crate::pushes::Kick;
 use crate::testing::{emp27, goal_library, policy};
 
 fn pool(robot: &Robot, threads: usize) -> Pool {

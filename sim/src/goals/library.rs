@@ -4,7 +4,7 @@ use emp_robot::Robot;
 use rand::{Rng, RngExt as _};
 
 use super::piece::{GoalJoint, Piece, check_clips};
-use super::{GoalClip, GoalError, GoalStatistics, GoalStream, Source};
+use super::{GoalClip, GoalError, GoalStatistics, Source};
 
 /// Frames of a piece, as in the paper (section VI).
 pub(super) const PIECE: usize = 60;
@@ -19,7 +19,7 @@ const TEMPO: [f32; 2] = [0.8, 1.3];
 /// A piece's amplitude is at least this share of the stream's difficulty.
 const LEAST_AMPLITUDE: f32 = 0.5;
 
-/// Clips of one robot, from which [`GoalStream`]s draw. Immutable; share it in an [`Arc`](std::sync::Arc).
+/// Clips of one robot, from which [`GoalStream`](super::GoalStream)s draw. Immutable; share it in an [`Arc`](std::sync::Arc).
 #[derive(Debug)]
 pub struct GoalLibrary {
     clips: Vec<Entry>,
@@ -80,28 +80,6 @@ impl GoalLibrary {
     /// Number of goal joints.
     pub fn joints(&self) -> usize {
         self.joints.len()
-    }
-
-    /// An endless stream of goals that follows from `seed`. `difficulty` is the largest amplitude of a piece: 1 is the
-    /// clips' own, 0 the default pose.
-    pub fn stream(&self, seed: u64, difficulty: f32) -> GoalStream {
-        GoalStream::new(self, seed, difficulty)
-    }
-
-    /// The first goals of a stream as a clip: for tests that last longer than the clips do. Its source counts as
-    /// procedural, whatever the pieces are.
-    pub fn sample(&self, seed: u64, difficulty: f32, frames: usize) -> GoalClip {
-        let mut stream = self.stream(seed, difficulty);
-        let mut angles = vec![0.0; frames.max(1) * self.joints()];
-        for goal in angles.chunks_exact_mut(self.joints()) {
-            stream.next(self, goal);
-        }
-        GoalClip::from_angles(
-            format!("stream-{seed}"),
-            Source::Procedural,
-            self.joints(),
-            angles,
-        )
     }
 
     /// Draws a piece of a clip.

@@ -4,8 +4,8 @@ use rand::{Rng, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::GoalLibrary;
 use super::piece::Piece;
+use super::{GoalClip, GoalLibrary, Source};
 
 /// Peak joint speeds of the movement from one piece to the next, rad/s: from leisurely to brisk.
 const JOIN_SPEED: [f32; 2] = [1.0, 4.0];
@@ -54,8 +54,32 @@ struct State {
     velocity: Vec<f32>,
 }
 
+impl GoalLibrary {
+    /// An endless stream of goals that follows from `seed`. `difficulty` is the largest amplitude of a piece: 1 is the
+    /// clips' own, 0 the default pose.
+    pub fn stream(&self, seed: u64, difficulty: f32) -> GoalStream {
+        GoalStream::new(self, seed, difficulty)
+    }
+
+    /// The first goals of a stream as a clip: for tests that last longer than the clips do. Its source counts as
+    /// procedural, whatever the pieces are.
+    pub fn sample(&self, seed: u64, difficulty: f32, frames: usize) -> GoalClip {
+        let mut stream = self.stream(seed, difficulty);
+        let mut angles = vec![0.0; frames.max(1) * self.joints()];
+        for goal in angles.chunks_exact_mut(self.joints()) {
+            stream.next(self, goal);
+        }
+        GoalClip::from_angles(
+            format!("stream-{seed}"),
+            Source::Procedural,
+            self.joints(),
+            angles,
+        )
+    }
+}
+
 impl GoalStream {
-    pub(super) fn new(library: &GoalLibrary, seed: u64, difficulty: f32) -> Self {
+    fn new(library: &GoalLibrary, seed: u64, difficulty: f32) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let current = Segment {
             join: None,

@@ -5,6 +5,7 @@
 //! kilobytes that are put on the stage, stepped, and taken off again. A step depends on nothing but the body and
 //! its targets: not on the stage, nor on who stood on it before.
 
+mod apply;
 mod body;
 mod fields;
 mod parameters;

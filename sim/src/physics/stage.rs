@@ -6,8 +6,9 @@ use emp_robot::Robot;
 use mujoco_rs::prelude::*;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
+use super::apply::apply;
 use super::body::{Body, Reading, SelfContact};
-use super::fields::{self, ModelFields};
+use super::fields::ModelFields;
 use super::parameters::BodyParameters;
 use super::rig::{FootRig, Rig};
 use crate::{Divergence, SimError};
@@ -213,7 +214,7 @@ impl Stage {
         }
         let rig = Arc::clone(&self.rig);
         self.load_fields(&nominal);
-        fields::apply(parameters, &rig, self.model_mut());
+        apply(parameters, &rig, self.model_mut());
         self.data.set_const();
         self.fields = Arc::new(ModelFields::read(self.data.model()));
         Arc::clone(&self.fields)

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use emp_robot::Robot;
 use nalgebra::Vector3;
 
-use super::fields;
+use super::apply::apply;
 use super::*;
 use crate::testing::{for_each_robot, pose};
 use crate::{Divergence, Pool, Priority};
@@ -133,7 +133,7 @@ fn the_model_on_stage_is_the_one_that_would_be_made_for_the_body() {
         let mut made = Stage::new(robot).unwrap();
         let nominal = bytes(&mut made);
         let rig = Arc::clone(&made.rig);
-        fields::apply(&odd(robot, 3), &rig, made.model_mut());
+        apply(&odd(robot, 3), &rig, made.model_mut());
         made.data.set_const();
         assert!(on_stage == bytes(&mut made), "{}", robot.name());
         assert!(on_stage != nominal);

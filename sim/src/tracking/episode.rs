@@ -8,12 +8,10 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::TrackingSettings;
-use crate::environment::{
-    Conditions, EndReason, EnvironmentConfig, Kind, Randomization, Subject, within,
-};
-use crate::evaluation::Kick;
+use crate::environment::{Conditions, EndReason, EnvironmentConfig, Kind, Randomization, Subject};
 use crate::goals::{GoalClip, GoalJoint, Piece};
-use crate::pushes::Pushes;
+use crate::pushes::{Kick, Pushes};
+use crate::ranges::within;
 use crate::{End, SimError, Stage};
 
 /// What all environments share.

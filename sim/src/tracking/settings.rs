@@ -4,7 +4,8 @@ use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
-use crate::environment::{MassRange, Randomization, check_range};
+use crate::environment::{MassRange, Randomization};
+use crate::ranges::check_range;
 
 /// What the episodes of [`TrackingEnvironments`](super::TrackingEnvironments) are drawn from. The default goes from the test
 /// conditions to beyond what a policy stands.

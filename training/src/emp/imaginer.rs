@@ -8,11 +8,11 @@ use rand::{SeedableRng as _, seq::SliceRandom as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
+    equipment::Equipment,
     imagination::Imagination,
     learner::usable_rows,
     rollout::{Collector, Rollout},
     settings::Settings,
-    trainer::{Equipment, environments},
 };
 use crate::world_model::{
     learner::WorldModelLearner,
@@ -41,7 +41,7 @@ impl Imaginer {
     /// When a setting is out of bounds, or the simulation fails.
     pub fn new(equipment: &Equipment, settings: &Settings) -> Result<Self> {
         let seed = settings.seed ^ SEED;
-        let mut collector = Collector::new(environments(equipment, settings, seed)?);
+        let mut collector = Collector::new(equipment.environments(settings, seed)?);
         let rollout = collect(&mut collector, settings, equipment)?;
         let sample = sequences(&collector, &rollout, &usable_rows(&rollout, 1), 1);
         let learner = settings.world_model.learner.clone();

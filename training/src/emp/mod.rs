@@ -2,6 +2,7 @@
 
 pub mod ablation;
 pub mod data;
+pub mod equipment;
 pub mod falls;
 pub mod hindsight;
 pub mod imagination;

@@ -14,10 +14,10 @@ use emp_models::{
     emp::{self, Emp, NETWORK_PREFIX},
 };
 use emp_robot::Robot;
-use emp_sim::{Pool, goals::GoalClip, tracking::TrackingEnvironments};
 use serde::{Deserialize, Serialize};
 
 use super::{
+    equipment::Equipment,
     hindsight::{Counts, Hindsight},
     imaginer::Imaginer,
     judge::{Judge, Verdict},
@@ -30,7 +30,6 @@ use crate::{
     log::CsvLog,
     run::{self, Interrupt, Outcome, RunFiles},
 };
-use emp_models::policy::Policy;
 
 /// Kind of the checkpoints in a run's folder, which hold the optimiser and the environments too.
 const RUN_KIND: &str = "emp-run";
@@ -58,21 +57,6 @@ const COLUMNS: [&str; 16] = [
     "seconds_replaying",
     "seconds_learning",
 ];
-
-/// What a run trains with.
-#[derive(Clone)]
-pub struct Equipment {
-    /// The robot.
-    pub robot: Arc<Robot>,
-    /// The frozen policy.
-    pub policy: Arc<Policy>,
-    /// Physics.
-    pub pool: Arc<Pool>,
-    /// The clips.
-    pub clips: Arc<[GoalClip]>,
-    /// Threads of forward and backward passes.
-    pub threads: Arc<rayon::ThreadPool>,
-}
 
 /// A run: the learner, its environments, and how far they are.
 pub struct Trainer {
@@ -124,7 +108,7 @@ impl Trainer {
     /// When a setting is out of bounds, or the robot falls whatever it is asked for.
     pub fn new(equipment: Equipment, settings: Settings) -> Result<Self> {
         settings.check()?;
-        let mut collector = Collector::new(environments(&equipment, &settings, settings.seed)?);
+        let mut collector = Collector::new(equipment.environments(&settings, settings.seed)?);
         let rollout = collector.collect(None, settings.warm_up, 0, &equipment.threads)?;
         let layout = *collector.environments().layout();
         let warm_up = WarmUp::new(rollout, &layout)?;
@@ -417,23 +401,6 @@ pub fn train(
     trainer.save_run(&run.files.checkpoint())?;
     bar.finish();
     Ok(Outcome::Finished)
-}
-
-/// Environments whose episodes follow from `seed`.
-pub(super) fn environments(
-    equipment: &Equipment,
-    settings: &Settings,
-    seed: u64,
-) -> Result<TrackingEnvironments> {
-    Ok(TrackingEnvironments::new(
-        Arc::clone(&equipment.robot),
-        Arc::clone(&equipment.pool),
-        Arc::clone(&equipment.policy),
-        settings.episodes,
-        Arc::clone(&equipment.clips),
-        0..settings.environments as u64,
-        seed,
-    )?)
 }
 
 fn mean(values: &[f32]) -> f64 {

@@ -1,4 +1,4 @@
-//! `emp-train world-model` and `emp-train world-model-report`.
+//! `emp-train world-model`.
 
 use std::{
     path::{Path, PathBuf},
@@ -7,27 +7,23 @@ use std::{
     time::Duration,
 };
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::Result;
 use clap::Args;
-use emp_models::{policy::Policy, retarget::Retargeter, world_model::WorldModel};
+use emp_models::{policy::Policy, retarget::Retargeter};
 use emp_robot::Robot;
-use emp_sim::{
-    Pool, Priority,
-    tracking::{TrackingEnvironments, TrackingSettings},
-};
+use emp_sim::{Pool, Priority};
 use emp_training::{
     emp::data::{self, Motions},
     run::{Interrupt, Outcome, RunFiles},
     world_model::{
-        accuracy,
         settings::Settings,
         trainer::{self, Equipment, Trainer},
     },
 };
 
-use crate::{
-    RobotArguments, policy_weights, retargeter_weights,
-    trial::{TrialArguments, printed},
+use super::arguments::{
+    RobotArguments, interrupted, learner_threads, policy_weights, refuse_overwriting,
+    retargeter_weights,
 };
 
 /// What is trained, and on what.
@@ -89,11 +85,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         save_every: Duration::from_secs(arguments.save_every),
     };
     let checkpoint = files.checkpoint();
-    ensure!(
-        arguments.resume || !checkpoint.exists(),
-        "{} exists: continue with --resume, or remove it, or name another --run",
-        checkpoint.display()
-    );
+    refuse_overwriting(&checkpoint, arguments.resume)?;
     let settings = settings(arguments);
     settings.check()?;
     let (equipment, data) = equipment(arguments, robot, &settings)?;
@@ -108,11 +100,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
             eprintln!("wrote {}", files.weights.display());
             Ok(ExitCode::SUCCESS)
         }
-        Outcome::Interrupted => {
-            let steps = trainer.steps();
-            eprintln!("interrupted at step {steps}; continue with --resume");
-            Ok(ExitCode::from(3))
-        }
+        Outcome::Interrupted => Ok(interrupted(trainer.steps())),
     }
 }
 
@@ -149,63 +137,16 @@ fn equipment(
         policy: Arc::new(Policy::load(&weights, Arc::clone(&robot))?),
         pool: Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?),
         clips: clips.into(),
-        threads: threads(arguments.threads)?,
+        threads: learner_threads(arguments.threads)?,
         robot,
     };
     Ok((equipment, data))
 }
 
-/// What is measured, and on what.
-#[derive(Args)]
-pub(crate) struct ReportArguments {
-    #[command(flatten)]
-    robot: RobotArguments,
-    #[command(flatten)]
-    trial: TrialArguments,
-    /// The world model [default: runs/world-model-ROBOT/model.safetensors].
-    #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
-    /// Environments stepped side by side.
-    #[arg(long, default_value_t = 256)]
-    environments: u64,
-    /// Control periods of each.
-    #[arg(long, default_value_t = 800)]
-    frames: usize,
-    /// Print JSON instead of a table.
-    #[arg(long)]
-    json: bool,
-}
-
-/// Measures a world model and prints the result.
-pub(crate) fn report(arguments: &ReportArguments) -> Result<ExitCode> {
-    let (robot, trial) = (arguments.robot.load()?, &arguments.trial);
-    let file = arguments.model.clone();
-    let file = file.unwrap_or_else(|| model_file(&run_folder(&robot)));
-    let model = WorldModel::load(&file, &robot)?;
-    let mut environments = TrackingEnvironments::new(
-        Arc::clone(&robot),
-        Arc::new(trial.pool(&robot)?),
-        trial.policy(&robot)?,
-        TrackingSettings::default(),
-        trial.clips(&robot)?.into(),
-        0..arguments.environments,
-        trial.seed,
-    )?;
-    let threads = threads(trial.threads)?;
-    let accuracy = accuracy::measure(&model, &mut environments, arguments.frames, &threads)?;
-    print!("{}", printed(&accuracy, arguments.json)?);
-    Ok(ExitCode::SUCCESS)
-}
-
-fn run_folder(robot: &Robot) -> PathBuf {
+pub(super) fn run_folder(robot: &Robot) -> PathBuf {
     PathBuf::from(format!("runs/world-model-{}", robot.name()))
 }
 
-fn model_file(folder: &Path) -> PathBuf {
+pub(super) fn model_file(folder: &Path) -> PathBuf {
     folder.join("model.safetensors")
-}
-
-fn threads(count: usize) -> Result<rayon::ThreadPool> {
-    let threads = rayon::ThreadPoolBuilder::new().num_threads(count);
-    threads.build().context("starting the learner's threads")
 }

@@ -8,8 +8,8 @@ use emp_models::emp::Emp;
 use emp_sim::suite::Condition;
 use emp_training::emp::falls::{self, FallRun};
 
-use crate::{
-    RobotArguments,
+use super::{
+    arguments::RobotArguments,
     trial::{EpisodeProgress, TrialArguments, printed},
 };
 

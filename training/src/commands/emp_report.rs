@@ -8,8 +8,8 @@ use emp_models::{checkpoint::write_atomically, emp::Emp, linear};
 use emp_robot::Robot;
 use emp_training::emp::report::{self, Candidate, EmpRun, Family};
 
-use crate::{
-    RobotArguments,
+use super::{
+    arguments::RobotArguments,
     trial::{EpisodeProgress, TrialArguments, printed},
 };
 

@@ -17,7 +17,7 @@ use emp_training::{
     run::{self, Interrupt},
 };
 
-use crate::{policy_weights, retargeter_weights};
+use super::arguments::{policy_weights, retargeter_weights};
 
 /// Training draws its skills from other seeds.
 const PROCEDURAL_SEED: u64 = 0x7265_706f_7274;

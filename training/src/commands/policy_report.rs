@@ -7,8 +7,8 @@ use clap::Args;
 use emp_models::{checkpoint::write_atomically, controller::Controller, filters::DECOUPLED};
 use emp_training::policy::report;
 
-use crate::{
-    RobotArguments,
+use super::{
+    arguments::RobotArguments,
     trial::{EpisodeProgress, TrialArguments, printed},
 };
 

@@ -1,7 +1,7 @@
 //! Domain randomisation (paper, table "Domain Randomization").
 
 use emp_robot::Robot;
-use rand::{Rng, RngExt as _};
+use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::pushes::Push;

@@ -5,15 +5,13 @@ use mujoco_rs::prelude::*;
 use mujoco_rs::wrappers::mj_auxiliary::MjStatistic;
 use mujoco_rs::wrappers::mj_model::MjtSameFrame;
 
-use super::parameters::BodyParameters;
-
 /// Number of the stiffness in a servo's gains.
 pub(super) const GAIN: usize = 0;
 
 /// Declares the fields that are copied between a model and [`ModelFields`] as they are.
 macro_rules! model_fields {
     ($($(#[$doc:meta])* $name:ident / $name_mut:ident: $type:ty,)*) => {
-        /// A model's fields that [`BodyParameters`] change, and those that MuJoCo derives from them (`mj_setConst`).
+        /// A model's fields that [`BodyParameters`](super::BodyParameters) change, and those that MuJoCo derives from them (`mj_setConst`).
         #[derive(Debug)]
         pub(crate) struct ModelFields {
             $($(#[$doc])* $name: Box<[$type]>,)*

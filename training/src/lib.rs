@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 pub mod emp;
+pub mod equipment;
 pub mod log;
 pub mod policy;
 pub mod retargeter;

@@ -97,6 +97,16 @@ const EMP: &str = "--steps 2560 --set environments=16 --set frames=8 --set warm_
                    --set hindsight.horizon=4 --set hindsight.window=2 --set optimizer.rows=64 \
                    --set evaluation_clips=1 --set evaluate_every=1000000";
 
+/// A small run of a world model.
+const WORLD_MODEL: &[&str] = &[
+    "world-model",
+    "--steps=100",
+    "--environments=8",
+    "--rows=16",
+    "--loss-steps=3",
+    "--procedural-clips=2",
+];
+
 #[test]
 fn an_emp_that_learns_the_price_of_falls_resumes_bit_for_bit() {
     let arguments = format!("emp --preset default {EMP}");
@@ -107,14 +117,19 @@ fn an_emp_that_learns_the_price_of_falls_resumes_bit_for_bit() {
 fn an_emp_that_imagines_resumes_bit_for_bit() {
     let sizes = "--set network.state_hidden=[16] --set network.target_hidden=[16] \
                  --set network.fusion_hidden=[16] --set network.decoder_hidden=[16] \
-                 --set world_model.learner.hidden=[16] --set horizon=2 --set wm_loss_steps=2";
-    let arguments = format!("emp --preset paper {EMP} {sizes}");
+                 --set horizon=2";
+    let folder = tempfile::tempdir().unwrap();
+    let mut world_model = trainer(WORLD_MODEL, folder.path(), 2);
+    assert!(world_model.status().unwrap().success());
+    let file = folder.path().join("weights.safetensors");
+    let arguments = format!(
+        "emp --preset paper --world-model {} {EMP} {sizes}",
+        file.display()
+    );
     check(&arguments.split_whitespace().collect::<Vec<_>>(), 20);
 }
 
 #[test]
 fn a_world_model_resumes_bit_for_bit() {
-    let arguments = "world-model --steps 100 --environments 8 --rows 16 --loss-steps 3 \
-                     --procedural-clips 2";
-    check(&arguments.split_whitespace().collect::<Vec<_>>(), 4);
+    check(WORLD_MODEL, 4);
 }

@@ -9,11 +9,12 @@ use emp_sim::{Pool, Priority};
 use emp_training::{
     emp::{
         data::{self, Motions},
-        equipment::Equipment,
+        imagination::FrozenWorldModel,
         judge::Judge,
         settings::{Preset, Settings},
         trainer::{self, Run, Trainer},
     },
+    equipment::Equipment,
     run::{Interrupt, Outcome, RunFiles},
 };
 
@@ -44,6 +45,9 @@ pub(super) struct TrainingArguments {
     /// The frozen policy [default: models/weights/ROBOT-policy.safetensors].
     #[arg(long, value_name = "FILE")]
     policy: Option<PathBuf>,
+    /// The world model that imagines (`emp-train world-model`), where the setting `horizon` is above 0, as in the paper's preset.
+    #[arg(long, value_name = "FILE")]
+    world_model: Option<PathBuf>,
     /// Weights of the retargeter [default: models/weights/ROBOT-retargeter.safetensors].
     #[arg(long, value_name = "FILE")]
     retargeter: Option<PathBuf>,
@@ -65,6 +69,7 @@ pub(super) struct TrainingArguments {
 pub(super) struct Setup {
     pub(super) equipment: Equipment,
     pub(super) judge: Judge,
+    world_model: Option<FrozenWorldModel>,
     data: serde_json::Value,
 }
 
@@ -75,6 +80,9 @@ impl Setup {
         let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
         let weights = policy_weights(arguments.policy.as_ref(), &robot);
         let policy = Arc::new(Policy::load(&weights, Arc::clone(&robot))?);
+        let world_model = arguments.world_model.as_ref();
+        let world_model = world_model.map(|file| FrozenWorldModel::load(file, &robot));
+        let world_model = world_model.transpose()?;
         let pool = Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?);
         let motions = Motions {
             folders: &arguments.motions,
@@ -100,6 +108,7 @@ impl Setup {
                 clips: clips.into(),
                 threads: Arc::new(learner_threads(arguments.threads)?),
             },
+            world_model,
             data,
         })
     }
@@ -113,11 +122,18 @@ impl Setup {
         interrupt: &Interrupt,
     ) -> Result<Option<ExitCode>> {
         let equipment = self.equipment.clone();
+        let world_model = self.world_model.as_ref();
         let checkpoint = files.checkpoint();
         let mut trainer = if checkpoint.exists() {
-            Trainer::resume(equipment, settings, &checkpoint, arguments.change_settings)?
+            Trainer::resume(
+                equipment,
+                world_model,
+                settings,
+                &checkpoint,
+                arguments.change_settings,
+            )?
         } else {
-            Trainer::new(equipment, settings)?
+            Trainer::new(equipment, world_model, settings)?
         };
         let run = Run {
             files,

@@ -14,10 +14,11 @@ use emp_robot::Robot;
 use emp_sim::{Pool, Priority};
 use emp_training::{
     emp::data::{self, Motions},
+    equipment::Equipment,
     run::{Interrupt, Outcome, RunFiles},
     world_model::{
         settings::Settings,
-        trainer::{self, Equipment, Trainer},
+        trainer::{self, Trainer},
     },
 };
 
@@ -137,7 +138,7 @@ fn equipment(
         policy: Arc::new(Policy::load(&weights, Arc::clone(&robot))?),
         pool: Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?),
         clips: clips.into(),
-        threads: learner_threads(arguments.threads)?,
+        threads: Arc::new(learner_threads(arguments.threads)?),
         robot,
     };
     Ok((equipment, data))

@@ -1,9 +1,12 @@
 //! Imagined control periods: EMP → goal inside `S_t` → frozen policy → frozen world model (paper, Algorithm 1; erratum E9).
 
-use std::sync::Arc;
+use std::{path::Path, sync::Arc};
 
 use candle_core::{Device, Tensor, bail};
-use emp_models::{emp::EmpNetwork, policy::Policy, world_model::WorldModel};
+use emp_models::{
+    ModelError, checkpoint, emp::EmpNetwork, policy::Policy, world_model::WorldModel,
+};
+use emp_robot::Robot;
 
 /// One imagined control period of a batch.
 #[derive(Clone, Debug)]
@@ -16,6 +19,29 @@ pub struct ImaginedStep {
     pub joint_positions: Tensor,
     /// Roll, pitch and yaw that it predicts for t + 1 (N × 3, rad).
     pub orientation: Tensor,
+}
+
+/// A world model that was trained before and stays as it is.
+#[derive(Clone)]
+pub struct FrozenWorldModel {
+    /// The model.
+    pub model: WorldModel,
+    /// The version of its weights.
+    pub version: String,
+}
+
+impl FrozenWorldModel {
+    /// Loads what `emp-train world-model` wrote for `robot`.
+    ///
+    /// # Errors
+    /// When the file is damaged or of another robot.
+    pub fn load(path: &Path, robot: &Robot) -> Result<Self, ModelError> {
+        let (metadata, _) = checkpoint::load(path)?;
+        Ok(Self {
+            model: WorldModel::load(path, robot)?,
+            version: metadata.version().to_owned(),
+        })
+    }
 }
 
 /// A policy and a world model that stay as they are; gradients pass through them.

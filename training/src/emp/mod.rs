@@ -2,11 +2,9 @@
 
 pub mod ablation;
 pub mod data;
-pub mod equipment;
 pub mod falls;
 pub mod hindsight;
 pub mod imagination;
-pub mod imaginer;
 pub mod judge;
 pub mod learner;
 pub mod losses;

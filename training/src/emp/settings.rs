@@ -10,7 +10,6 @@ use emp_sim::tracking::TrackingSettings;
 use serde::{Deserialize, Serialize};
 
 use super::losses::{CenOn, CenRef, Distance, LossSettings, LossWeights, SmoothOn};
-use crate::world_model::settings::LearnerSettings;
 
 /// A set of settings with a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -39,13 +38,9 @@ pub struct Settings {
     pub network: NetworkSettings,
     /// The six losses.
     pub losses: LossSettings,
-    /// Imagined control periods over which the losses are taken; 1 is the paper's. 0: nothing is imagined, and the losses see
-    /// ĝ and the measured robot alone.
+    /// Imagined control periods over which the losses are taken; 1 is the paper's, and a world model is needed. 0: nothing is
+    /// imagined, and the losses see ĝ and the measured robot alone.
     pub horizon: usize,
-    /// Control periods of the world model's loss beyond which it is not followed; 1 is the paper's.
-    pub wm_loss_steps: usize,
-    /// How the world model learns, where anything is imagined.
-    pub world_model: WorldModelSettings,
     /// What should have been asked for before a fall.
     pub hindsight: HindsightSettings,
     /// Steps of the optimiser.
@@ -106,20 +101,6 @@ impl NetworkSettings {
             gate: self.gate,
         }
     }
-}
-
-/// How the world model learns beside the EMP.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct WorldModelSettings {
-    /// Mini-batches after each rollout.
-    pub updates: usize,
-    /// Rows of a mini-batch.
-    pub rows: usize,
-    /// Step size.
-    pub learning_rate: f64,
-    /// Its network.
-    pub learner: LearnerSettings,
 }
 
 /// The lesson of falls and contacts: see [`Hindsight`](super::hindsight::Hindsight).
@@ -243,13 +224,6 @@ impl Settings {
             },
             losses: LossSettings::default(),
             horizon: 1,
-            wm_loss_steps: 1,
-            world_model: WorldModelSettings {
-                updates: 8,
-                rows: 256,
-                learning_rate: 5e-4,
-                learner: LearnerSettings::default(),
-            },
             hindsight: HindsightSettings {
                 weight: 0.0,
                 contact_weight: 0.0,
@@ -371,13 +345,6 @@ impl Settings {
             ("environments", self.environments),
             ("frames", self.frames),
             ("warm_up", self.warm_up),
-            ("wm_loss_steps", self.wm_loss_steps),
-            ("world_model.updates", self.world_model.updates),
-            ("world_model.rows", self.world_model.rows),
-            (
-                "world_model.learner.shards",
-                self.world_model.learner.shards,
-            ),
             ("optimizer.updates", self.optimizer.updates),
             ("optimizer.rows", self.optimizer.rows),
             ("optimizer.shards", self.optimizer.shards),
@@ -386,14 +353,9 @@ impl Settings {
         if let Some((name, _)) = counts.iter().find(|(_, count)| *count == 0) {
             bail!("setting `{name}` is 0, expected at least 1");
         }
-        for (name, steps) in [
-            ("horizon", self.horizon),
-            ("wm_loss_steps", self.wm_loss_steps),
-        ] {
-            if steps > self.frames {
-                let frames = self.frames;
-                bail!("setting `{name}` is {steps}, expected at most `frames`, {frames}");
-            }
+        let (horizon, frames) = (self.horizon, self.frames);
+        if horizon > frames {
+            bail!("setting `horizon` is {horizon}, expected at most `frames`, {frames}");
         }
         let averaging = self.optimizer.averaging;
         if !(0.0..1.0).contains(&averaging) {
@@ -488,9 +450,6 @@ mod tests {
         let paper = Settings::preset(Preset::Paper);
         assert_eq!(paper.network.config(&robot), EmpConfig::paper(&robot));
         assert_eq!(paper.losses, LossSettings::default());
-        assert_eq!(
-            (paper.horizon, paper.wm_loss_steps, paper.hindsight.weight),
-            (1, 1, 0.0)
-        );
+        assert_eq!((paper.horizon, paper.hindsight.weight), (1, 0.0));
     }
 }

@@ -1,8 +1,8 @@
-//! The training loop of the EMP (paper, Algorithm 1): rollouts with goals as they are asked for teach the world model, rollouts
-//! with the EMP's goals teach the EMP, in turn.
+//! The training loop of the EMP (paper, Algorithm 1): rollouts with the EMP's goals teach the EMP.
 //!
 //! The paper updates after every control period of a batch of clips; we update after every few, on mini-batches of them: one
-//! update then sees many moments of many clips. Without imagination there is no world model to teach.
+//! update then sees many moments of many clips. The paper's world model learns in turns with the EMP; ours is trained before
+//! ([`crate::world_model`]) and stays as it is.
 
 use std::{path::Path, sync::Arc, time::Instant};
 
@@ -17,9 +17,8 @@ use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    equipment::Equipment,
     hindsight::{Counts, Hindsight},
-    imaginer::Imaginer,
+    imagination::{FrozenWorldModel, Imagination},
     judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics, WarmUp},
     objective::Terms,
@@ -27,6 +26,7 @@ use super::{
     settings::Settings,
 };
 use crate::{
+    equipment::Equipment,
     log::CsvLog,
     run::{self, Interrupt, Outcome, RunFiles},
 };
@@ -34,13 +34,11 @@ use crate::{
 /// Kind of the checkpoints in a run's folder, which hold the optimiser and the environments too.
 const RUN_KIND: &str = "emp-run";
 
-/// Snapshots in a checkpoint: of the EMP's environments, and of the world model's.
+/// The environments' snapshot in a checkpoint.
 const ENVIRONMENTS: &str = "environments";
-const IMAGINED_ENVIRONMENTS: &str = "environments.world-model";
 
 /// Columns of the log after the step and the losses.
-const COLUMNS: [&str; 16] = [
-    "world_model",
+const COLUMNS: [&str; 15] = [
     "hindsight",
     "falls",
     "contact",
@@ -66,8 +64,10 @@ pub struct Trainer {
     past: Vec<Phase>,
     collector: Collector,
     learner: Learner,
-    /// The world model, where anything is imagined.
-    imaginer: Option<Imaginer>,
+    /// Policy and world model, where anything is imagined.
+    imagination: Option<Imagination>,
+    /// Version of the world model.
+    world_model: Option<String>,
     /// Environment steps of the EMP learnt from.
     steps: u64,
 }
@@ -77,6 +77,8 @@ pub struct Trainer {
 struct Phase {
     until_step: u64,
     settings: Settings,
+    #[serde(default)]
+    world_model: Option<String>,
 }
 
 /// What a run's checkpoint says of its progress.
@@ -87,8 +89,8 @@ struct Saved {
     past: Vec<Phase>,
     steps: u64,
     learner: learner::Progress,
-    /// Rollouts and optimiser steps of the world model.
-    imaginer: Option<[u64; 2]>,
+    /// Version of the world model.
+    world_model: Option<String>,
 }
 
 /// A run's files and its judge.
@@ -102,22 +104,37 @@ pub struct Run<'a> {
 }
 
 impl Trainer {
-    /// Starts with random weights.
+    /// Starts with random weights. `world_model` is read where the settings imagine.
     ///
     /// # Errors
-    /// When a setting is out of bounds, or the robot falls whatever it is asked for.
-    pub fn new(equipment: Equipment, settings: Settings) -> Result<Self> {
+    /// When a setting is out of bounds, a world model is missing, or the robot falls whatever it is asked for.
+    pub fn new(
+        equipment: Equipment,
+        world_model: Option<&FrozenWorldModel>,
+        settings: Settings,
+    ) -> Result<Self> {
         settings.check()?;
-        let mut collector = Collector::new(equipment.environments(&settings, settings.seed)?);
+        let world_model = match settings.horizon {
+            0 => None,
+            horizon => Some(world_model.with_context(|| {
+                format!(
+                    "setting `horizon` is {horizon}: imagining needs a world model (--world-model)"
+                )
+            })?),
+        };
+        let imagine = |world_model: &FrozenWorldModel| {
+            Imagination::new(Arc::clone(&equipment.policy), world_model.model.clone())
+        };
+        let (episodes, count) = (settings.episodes, settings.environments);
+        let environments = equipment.environments(episodes, count, settings.seed)?;
+        let mut collector = Collector::new(environments);
         let rollout = collector.collect(None, settings.warm_up, 0, &equipment.threads)?;
         let layout = *collector.environments().layout();
         let warm_up = WarmUp::new(rollout, &layout)?;
         Ok(Self {
             learner: Learner::new(&equipment.robot, &settings, &warm_up)?,
-            imaginer: match settings.horizon {
-                0 => None,
-                _ => Some(Imaginer::new(&equipment, &settings)?),
-            },
+            imagination: world_model.map(imagine).transpose()?,
+            world_model: world_model.map(|world_model| world_model.version.clone()),
             collector,
             equipment,
             settings,
@@ -133,6 +150,7 @@ impl Trainer {
     /// When the checkpoint is damaged, or its run had another robot, other networks or, unasked, other settings.
     pub fn resume(
         equipment: Equipment,
+        world_model: Option<&FrozenWorldModel>,
         settings: Settings,
         path: &Path,
         may_change: bool,
@@ -147,26 +165,26 @@ impl Trainer {
             path.display(),
             saved.settings
         );
-        let mut snapshot = |name: &str| {
-            let snapshot = tensors
-                .remove(name)
-                .with_context(|| format!("{}: no tensor `{name}`", path.display()))?;
-            Ok::<_, anyhow::Error>(snapshot.to_vec1::<u8>()?)
-        };
-        let environments = snapshot(ENVIRONMENTS)?;
-        let mut trainer = Self::new(equipment, settings)?;
+        let environments = tensors
+            .remove(ENVIRONMENTS)
+            .with_context(|| format!("{}: no tensor `{ENVIRONMENTS}`", path.display()))?
+            .to_vec1::<u8>()?;
+        let mut trainer = Self::new(equipment, world_model, settings)?;
+        ensure!(
+            may_change || saved.world_model == trainer.world_model,
+            "{}: the run has the world model {:?}, not {:?}; --change-settings starts a new phase of it",
+            path.display(),
+            saved.world_model,
+            trainer.world_model
+        );
         trainer.past = saved.past;
-        if saved.settings != trainer.settings {
+        let before = (&saved.settings, &saved.world_model);
+        if before != (&trainer.settings, &trainer.world_model) {
             trainer.past.push(Phase {
                 until_step: saved.steps,
                 settings: saved.settings,
+                world_model: saved.world_model,
             });
-        }
-        if let (Some(imaginer), Some(counts)) = (&mut trainer.imaginer, saved.imaginer) {
-            let environments = snapshot(IMAGINED_ENVIRONMENTS)?;
-            imaginer
-                .restore(&tensors, &environments, counts)
-                .with_context(|| path.display().to_string())?;
         }
         trainer
             .collector
@@ -216,6 +234,7 @@ impl Trainer {
             "past": self.past,
             "steps": self.steps,
             "policy": self.equipment.policy.metadata().version(),
+            "world_model": self.world_model,
             "operating_point": self.learner.reference(),
             "data": data,
             "figures": verdict,
@@ -237,18 +256,10 @@ impl Trainer {
     /// When the file cannot be written.
     pub fn save_run(&self, path: &Path) -> Result<()> {
         let mut tensors = self.learner.state()?;
-        let mut snapshots = vec![(ENVIRONMENTS, self.collector.snapshot()?)];
-        let mut counts = None;
-        if let Some(imaginer) = &self.imaginer {
-            let (environments, imaginers) = imaginer.save(&mut tensors)?;
-            snapshots.push((IMAGINED_ENVIRONMENTS, environments));
-            counts = Some(imaginers);
-        }
-        for (name, snapshot) in snapshots {
-            let bytes = snapshot.len();
-            let snapshot = Tensor::from_vec(snapshot, bytes, &Device::Cpu)?;
-            tensors.insert(name.to_owned(), snapshot);
-        }
+        let environments = self.collector.snapshot()?;
+        let bytes = environments.len();
+        let environments = Tensor::from_vec(environments, bytes, &Device::Cpu)?;
+        tensors.insert(ENVIRONMENTS.to_owned(), environments);
         let mut metadata = run_metadata(&self.equipment.robot);
         metadata.config = serde_json::to_value(self.learner.network().config())?;
         metadata.training = serde_json::to_value(Saved {
@@ -256,7 +267,7 @@ impl Trainer {
             past: self.past.clone(),
             steps: self.steps,
             learner: self.learner.progress(),
-            imaginer: counts,
+            world_model: self.world_model.clone(),
         })?;
         checkpoint::save(path, metadata, &tensors)?;
         Ok(())
@@ -264,11 +275,6 @@ impl Trainer {
 
     /// Collects a rollout and learns from it.
     fn step(&mut self) -> Result<Step> {
-        let (mut world_model, mut imagination) = (f64::NAN, None);
-        if let Some(imaginer) = &mut self.imaginer {
-            world_model = imaginer.learn(&self.equipment)?;
-            imagination = Some(imaginer.imagination(&self.equipment)?);
-        }
         let start = Instant::now();
         let threads = &self.equipment.threads;
         let network = self.learner.network().clone();
@@ -287,9 +293,12 @@ impl Trainer {
             labels = Some(found?);
         }
         let replaying = start.elapsed().as_secs_f64();
-        let update =
-            self.learner
-                .update(&rollout, labels.as_ref(), imagination.as_ref(), threads)?;
+        let update = self.learner.update(
+            &rollout,
+            labels.as_ref(),
+            self.imagination.as_ref(),
+            threads,
+        )?;
         let rows = rollout.rows();
         self.steps += rows as u64;
         let changes = rollout.answers.iter().zip(&rollout.goals);
@@ -299,7 +308,6 @@ impl Trainer {
             falls: rollout.falls(),
             contact: mean(&rollout.contact),
             episodes: rollout.episodes(),
-            world_model,
             update,
             collecting,
             replaying,
@@ -310,8 +318,6 @@ impl Trainer {
 
 /// What one rollout and its update measured.
 struct Step {
-    /// Loss of the world model; not a number without one.
-    world_model: f64,
     falls: usize,
     /// Mean force between the robot's own links, N.
     contact: f64,
@@ -329,7 +335,6 @@ impl Step {
         let (update, counts) = (&self.update, &self.counts);
         let mut row = update.terms.to_vec();
         row.extend([
-            self.world_model,
             update.hindsight,
             self.falls as f64,
             self.contact,

@@ -1,7 +1,7 @@
 //! The world model: one-step prediction of the robot, learnt from robots whose legs the policy moves (paper, section V-B).
 //!
-//! [`learner::WorldModelLearner`] learns from [`sequences::Sequences`], wherever they come from; [`trainer`] collects them and
-//! trains a model by itself; [`accuracy`] says how well it predicts.
+//! [`trainer`] collects [`sequences::Sequences`], from which [`learner::WorldModelLearner`] learns; [`accuracy`] says how well a
+//! model predicts. An EMP that imagines is trained with such a model ([`crate::emp::imagination`]).
 
 pub mod accuracy;
 pub mod explorer;

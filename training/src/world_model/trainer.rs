@@ -1,17 +1,15 @@
 //! The training loop of a world model: rounds of collecting and learning, log, checkpoints.
 
-use std::{path::Path, sync::Arc, time::Instant};
+use std::{path::Path, time::Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
 use emp_models::{
     CheckpointMetadata,
     checkpoint::{self, Tensors},
-    policy::Policy,
     world_model::WorldModel,
 };
 use emp_robot::Robot;
-use emp_sim::{Pool, goals::GoalClip, tracking::TrackingEnvironments};
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -24,6 +22,7 @@ use super::{
     settings::Settings,
 };
 use crate::{
+    equipment::Equipment,
     log::CsvLog,
     run::{self, Interrupt, Outcome, RunFiles},
 };
@@ -48,20 +47,6 @@ const COLUMNS: [&str; 7] = [
     "seconds_collecting",
     "seconds_learning",
 ];
-
-/// What a run trains with.
-pub struct Equipment {
-    /// The robot.
-    pub robot: Arc<Robot>,
-    /// The policy that moves the legs.
-    pub policy: Arc<Policy>,
-    /// Physics.
-    pub pool: Arc<Pool>,
-    /// The clips.
-    pub clips: Arc<[GoalClip]>,
-    /// Threads of forward and backward passes.
-    pub threads: rayon::ThreadPool,
-}
 
 /// A run: the learner, its environments, and how far they are.
 pub struct Trainer {
@@ -300,15 +285,8 @@ impl Round {
 /// Environments and nothing collected.
 fn empty(equipment: &Equipment, settings: &Settings) -> Result<(Explorer, Replay)> {
     settings.check()?;
-    let environments = TrackingEnvironments::new(
-        Arc::clone(&equipment.robot),
-        Arc::clone(&equipment.pool),
-        Arc::clone(&equipment.policy),
-        settings.episodes,
-        Arc::clone(&equipment.clips),
-        0..settings.environments as u64,
-        settings.seed,
-    )?;
+    let (episodes, count) = (settings.episodes, settings.environments);
+    let environments = equipment.environments(episodes, count, settings.seed)?;
     let replay = Replay::new(*environments.layout(), settings.capacity);
     let explorer = Explorer::new(environments, settings.goal_noise, settings.seed);
     Ok((explorer, replay))

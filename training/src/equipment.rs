@@ -1,20 +1,22 @@
-//! What a run trains with.
+//! What every training in simulation needs beside its settings.
 
 use std::sync::Arc;
 
 use anyhow::Result;
 use emp_models::policy::Policy;
 use emp_robot::Robot;
-use emp_sim::{Pool, goals::GoalClip, tracking::TrackingEnvironments};
-
-use super::settings::Settings;
+use emp_sim::{
+    Pool,
+    goals::GoalClip,
+    tracking::{TrackingEnvironments, TrackingSettings},
+};
 
 /// What a run trains with.
 #[derive(Clone)]
 pub struct Equipment {
     /// The robot.
     pub robot: Arc<Robot>,
-    /// The frozen policy.
+    /// The frozen policy, which moves the legs.
     pub policy: Arc<Policy>,
     /// Physics.
     pub pool: Arc<Pool>,
@@ -25,19 +27,20 @@ pub struct Equipment {
 }
 
 impl Equipment {
-    /// Environments whose episodes follow from `seed`.
-    pub(super) fn environments(
+    /// So many environments, whose episodes follow from `seed`.
+    pub(crate) fn environments(
         &self,
-        settings: &Settings,
+        episodes: TrackingSettings,
+        count: usize,
         seed: u64,
     ) -> Result<TrackingEnvironments> {
         Ok(TrackingEnvironments::new(
             Arc::clone(&self.robot),
             Arc::clone(&self.pool),
             Arc::clone(&self.policy),
-            settings.episodes,
+            episodes,
             Arc::clone(&self.clips),
-            0..settings.environments as u64,
+            0..count as u64,
             seed,
         )?)
     }

@@ -2,7 +2,7 @@
 
 use super::names::LIST;
 
-/// Why a specification is none.
+/// Why a specification cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FilterError {
     /// There is no such filter.

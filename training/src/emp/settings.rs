@@ -110,7 +110,7 @@ pub struct HindsightSettings {
     /// Weight of the distance to what should have been executed against a fall. With it the reconstruction loss counts only where
     /// the goal is known to have been right. 0: no hindsight.
     pub weight: f64,
-    /// The same against a contact. 0: contacts are let be.
+    /// The same against a contact. 0: nothing is learnt from contacts.
     pub contact_weight: f64,
     /// Control periods from one moment that is run again to the next.
     pub window: usize,

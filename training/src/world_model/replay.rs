@@ -140,7 +140,7 @@ impl Replay {
     /// Goes on from a [`snapshot`](Self::snapshot).
     ///
     /// # Errors
-    /// If it is none, or of other observations.
+    /// If it is not a snapshot of a replay, or of other observations.
     pub fn restore(&mut self, snapshot: &[u8]) -> Result<()> {
         let (segments, open): (VecDeque<Segment>, Vec<Option<Segment>>) =
             postcard::from_bytes(snapshot)?;

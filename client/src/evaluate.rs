@@ -9,10 +9,9 @@ use emp_client::{
     Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult, EvaluationStarted,
     GoalStatistics, MassRange, Metric, ProceduralClips, Push, Randomization, Spread,
 };
-use emp_motion::Clip;
+use emp_motion::{Clip, atomic};
 use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
-use tempfile::NamedTempFile;
 
 use crate::{
     cli::{self, Evaluate},
@@ -402,11 +401,7 @@ fn end(episode: &EpisodeResult) -> &'static str {
 
 /// Writes one row an episode to a temporary name beside `path`, which then appears whole.
 fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    let file = NamedTempFile::new_in(folder)?;
+    let file = atomic::temporary(path)?;
     let mut csv = Writer::from_writer(file.reopen()?);
     csv.write_record([
         "episode",
@@ -456,8 +451,7 @@ fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
         csv.write_record(row)?;
     }
     csv.flush()?;
-    file.persist(path)?;
-    Ok(())
+    Ok(atomic::persist(file, path)?)
 }
 
 #[cfg(test)]

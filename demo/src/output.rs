@@ -1,18 +1,16 @@
 //! What the demo leaves behind.
 
-use std::fs::Permissions;
-use std::io::Write;
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use anyhow::{Context, Result};
+use emp_motion::atomic;
 use emp_motion::joint_csv::JointCsvWriter;
 use emp_robot::Robot;
 
 use crate::control::Run;
 use crate::measure::Summary;
 use crate::motion::Motion;
-use crate::picture::{Moment, Sheet, StanceSheet, differing};
+use crate::picture::{Sheet, StanceSheet, Still, differing};
 use crate::posture::Posture;
 
 /// The output folder, and what was written there.
@@ -22,8 +20,8 @@ pub(crate) struct Files<'a> {
     pub(crate) written: Vec<&'static str>,
 }
 
-/// How many moments the sheets show.
-const MOMENTS: usize = 8;
+/// How many stills the sheets show.
+const STILLS: usize = 8;
 
 /// The contact sheet and the stance sheet as PNG files; `errors` are the frames' direction errors in degrees.
 pub(crate) fn sheets(
@@ -39,10 +37,10 @@ pub(crate) fn sheets(
         .into_iter()
         .chain(last_of_fall(run))
         .collect();
-    let moment = |index: usize| {
+    let still = |index: usize| {
         let posture = &postures[index];
         let time = motion.time(index);
-        Moment {
+        Still {
             time,
             name: motion.part(time).to_owned(),
             direction_error_deg: errors[index],
@@ -52,9 +50,9 @@ pub(crate) fn sheets(
             stance: posture.stance.clone(),
         }
     };
-    let moments: Vec<Moment> = differing(executed, &fixed, MOMENTS)
+    let stills: Vec<Still> = differing(executed, &fixed, STILLS)
         .into_iter()
-        .map(moment)
+        .map(still)
         .collect();
     let stances: Vec<_> = postures
         .iter()
@@ -70,12 +68,12 @@ pub(crate) fn sheets(
     let contact = Sheet {
         title: &title,
         subtitle: &summary.contact_subtitle(),
-        moments: &moments,
+        stills: &stills,
     };
     let stance = StanceSheet {
         title: &title,
         subtitle: &summary.stance_subtitle(),
-        moments: &moments,
+        stills: &stills,
         stances: &stances,
         rate: robot.control_rate_hz(),
         fall: summary.fall_time(),
@@ -140,14 +138,7 @@ impl<'a> Files<'a> {
     pub(crate) fn write(&mut self, name: &'static str, bytes: &[u8]) -> Result<()> {
         let path = self.folder.join(name);
         let context = || format!("cannot write {}", path.display());
-        // As any new file: readable for others where the user's mask allows it.
-        let everyone = Permissions::from_mode(0o666);
-        let mut file = tempfile::Builder::new()
-            .permissions(everyone)
-            .tempfile_in(self.folder)
-            .with_context(context)?;
-        file.write_all(bytes).with_context(context)?;
-        file.persist(&path).with_context(context)?;
+        atomic::write(&path, bytes).with_context(context)?;
         self.written.push(name);
         Ok(())
     }

@@ -2,11 +2,11 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
-    io::Write as _,
     path::Path,
 };
 
 use candle_core::{DType, Device, Tensor};
+use emp_motion::atomic;
 use emp_robot::{Joint, Robot};
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
@@ -216,7 +216,7 @@ pub fn save(
     tensors: &Tensors,
 ) -> Result<CheckpointMetadata, ModelError> {
     let (metadata, bytes) = encode(metadata, tensors)?;
-    write_atomically(path, &bytes).map_err(|reason| ModelError::Io {
+    atomic::write(path, &bytes).map_err(|reason| ModelError::Io {
         path: path.to_owned(),
         reason,
     })?;
@@ -238,23 +238,6 @@ pub fn encode(
     let header = HashMap::from([(METADATA_KEY.to_owned(), json)]);
     let bytes = safetensors::serialize(tensors, Some(header)).map_err(candle_core::Error::from)?;
     Ok((metadata, bytes))
-}
-
-/// Writes `bytes` next to `path` under a temporary name, then renames: a reader sees the old file or the new one.
-///
-/// # Errors
-/// When the folder cannot be made or the file cannot be written.
-pub fn write_atomically(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".partial");
-    let partial = path.with_file_name(name);
-    let mut file = std::fs::File::create(&partial)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    std::fs::rename(&partial, path)
 }
 
 fn hash(file: &SafeTensors<'_>) -> String {

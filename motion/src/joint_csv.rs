@@ -24,7 +24,7 @@ impl JointCsvWriter {
     /// [`MotionError::Io`] where the folder cannot be written.
     pub fn create<S: AsRef<str>>(path: &Path, joints: &[S]) -> Result<Self, MotionError> {
         let io = |e| MotionError::io(path, e);
-        let file = crate::atomic::temporary(path)?;
+        let file = crate::atomic::temporary(path).map_err(io)?;
         let mut csv = Writer::from_writer(file.reopen().map_err(io)?);
         let header = std::iter::once("time_s").chain(joints.iter().map(AsRef::as_ref));
         csv.write_record(header).map_err(|e| io(e.into()))?;
@@ -61,9 +61,8 @@ impl JointCsvWriter {
     /// # Errors
     /// [`MotionError::Io`] where the disk refuses.
     pub fn finish(mut self) -> Result<(), MotionError> {
-        self.csv
-            .flush()
-            .map_err(|e| MotionError::io(&self.path, e))?;
-        crate::atomic::persist(self.file, &self.path)
+        let io = |e| MotionError::io(&self.path, e);
+        self.csv.flush().map_err(io)?;
+        crate::atomic::persist(self.file, &self.path).map_err(io)
     }
 }

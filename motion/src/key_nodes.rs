@@ -52,9 +52,10 @@ pub fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Clip, MotionError> {
 /// # Errors
 /// [`MotionError::Io`] where the folder cannot be written.
 pub fn write(path: &Path, clip: &Clip) -> Result<(), MotionError> {
-    let mut file = crate::atomic::temporary(path)?;
-    write_to(file.as_file_mut(), clip).map_err(|e| MotionError::io(path, e))?;
-    crate::atomic::persist(file, path)
+    let io = |e| MotionError::io(path, e);
+    let mut file = crate::atomic::temporary(path).map_err(io)?;
+    write_to(file.as_file_mut(), clip).map_err(io)?;
+    crate::atomic::persist(file, path).map_err(io)
 }
 
 fn write_to<W: std::io::Write + std::io::Seek>(file: W, clip: &Clip) -> std::io::Result<W> {

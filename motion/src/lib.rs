@@ -10,7 +10,7 @@
 #![forbid(unsafe_code)]
 
 pub mod amass;
-mod atomic;
+pub mod atomic;
 pub mod bvh;
 mod clip;
 mod error;

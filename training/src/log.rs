@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, ensure};
-use emp_models::checkpoint::write_atomically;
+use emp_motion::atomic;
 
 /// Appends rows of numbers to a CSV file whose first column is the step.
 pub struct CsvLog {
@@ -34,7 +34,7 @@ impl CsvLog {
             text.write_record(row)?;
         }
         let bytes = text.into_inner().map_err(csv::IntoInnerError::into_error)?;
-        write_atomically(path, &bytes).with_context(|| format!("writing {}", path.display()))?;
+        atomic::write(path, &bytes).with_context(|| format!("writing {}", path.display()))?;
         let file = OpenOptions::new()
             .append(true)
             .open(path)

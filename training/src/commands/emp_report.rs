@@ -4,7 +4,8 @@ use std::{path::PathBuf, process::ExitCode, str::FromStr, sync::Arc};
 
 use anyhow::{Context as _, Result};
 use clap::Args;
-use emp_models::{checkpoint::write_atomically, emp::Emp, linear};
+use emp_models::{emp::Emp, linear};
+use emp_motion::atomic;
 use emp_robot::Robot;
 use emp_training::emp::report::{self, Candidate, EmpRun, Family};
 
@@ -120,7 +121,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     if let Some(folder) = &arguments.out {
         for (name, json) in [("emp-report.md", false), ("emp-report.json", true)] {
             let path = folder.join(name);
-            write_atomically(&path, printed(&report, json)?.as_bytes())
+            atomic::write(&path, printed(&report, json)?.as_bytes())
                 .with_context(|| format!("writing {}", path.display()))?;
         }
         report::draw(&report, &folder.join("frontier.svg"))?;

@@ -4,7 +4,8 @@ use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::{Context as _, Result};
 use clap::Args;
-use emp_models::{checkpoint::write_atomically, controller::Controller, filters::DECOUPLED};
+use emp_models::{controller::Controller, filters::DECOUPLED};
+use emp_motion::atomic;
 use emp_training::policy::report;
 
 use super::{
@@ -47,7 +48,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         Some(folder) => {
             let ladder = report::ladder(&pool, &controllers, &clips, seed, &mut progress)?;
             let csv = folder.join("ladder.csv");
-            write_atomically(&csv, ladder.csv().as_bytes())
+            atomic::write(&csv, ladder.csv().as_bytes())
                 .with_context(|| format!("writing {}", csv.display()))?;
             report::draw_ladder(&ladder, robot.name(), &folder.join("ladder.svg"))?;
             printed(&ladder, arguments.json)?

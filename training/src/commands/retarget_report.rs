@@ -4,7 +4,8 @@ use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::{Context as _, Result};
 use clap::Args;
-use emp_models::{checkpoint::write_atomically, retarget::Retargeter};
+use emp_models::retarget::Retargeter;
+use emp_motion::atomic;
 use emp_training::{
     retargeter::{data, report},
     run,
@@ -52,7 +53,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     bar.finish_and_clear();
     let json = serde_json::to_string_pretty(&report)?;
     if let Some(out) = &arguments.out {
-        write_atomically(out, json.as_bytes())
+        atomic::write(out, json.as_bytes())
             .with_context(|| format!("writing {}", out.display()))?;
     }
     if arguments.json {

@@ -7,7 +7,8 @@ use std::{
 };
 
 use anyhow::{Context as _, Result};
-use emp_models::{checkpoint::write_atomically, emp::Emp};
+use emp_models::emp::Emp;
+use emp_motion::atomic;
 use emp_robot::Robot;
 use emp_sim::{evaluation::Evaluation, suite::Condition};
 use serde::Serialize;
@@ -115,7 +116,7 @@ impl Table {
         let json = serde_json::to_string_pretty(self)?;
         for (name, text) in [("ablation.md", self.to_string()), ("ablation.json", json)] {
             let path = folder.join(name);
-            write_atomically(&path, text.as_bytes())
+            atomic::write(&path, text.as_bytes())
                 .with_context(|| format!("writing {}", path.display()))?;
         }
         Ok(())

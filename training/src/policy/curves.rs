@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, anyhow, ensure};
-use emp_models::checkpoint::write_atomically;
+use emp_motion::atomic;
 use emp_sim::environment::REWARD_NAMES;
 use plotters::{
     coord::Shift,
@@ -51,7 +51,7 @@ pub fn draw(logs: &[PathBuf], out: &Path) -> Result<()> {
         }
         area.present().map_err(failed)?;
     }
-    write_atomically(out, svg.as_bytes()).with_context(|| format!("writing {}", out.display()))
+    atomic::write(out, svg.as_bytes()).with_context(|| format!("writing {}", out.display()))
 }
 
 /// A run's name and its panels.

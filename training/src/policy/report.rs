@@ -3,7 +3,8 @@
 use std::{fmt, path::Path};
 
 use anyhow::{Context as _, Result, anyhow, ensure};
-use emp_models::{checkpoint::write_atomically, controller::Controller};
+use emp_models::controller::Controller;
+use emp_motion::atomic;
 use emp_sim::{
     Pool,
     evaluation::{Conditions, Evaluation, EvaluationSettings, Failure, Progress, Scores, evaluate},
@@ -260,7 +261,7 @@ pub fn draw_ladder(ladder: &Ladder, robot: &str, out: &Path) -> Result<()> {
         }
         area.present().map_err(failed)?;
     }
-    write_atomically(out, svg.as_bytes()).with_context(|| format!("writing {}", out.display()))
+    atomic::write(out, svg.as_bytes()).with_context(|| format!("writing {}", out.display()))
 }
 
 fn unit(axis: Axis) -> &'static str {

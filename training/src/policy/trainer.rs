@@ -6,9 +6,10 @@ use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
 use emp_models::{
     CheckpointMetadata,
-    checkpoint::{self, Tensors, write_atomically},
+    checkpoint::{self, Tensors},
     policy::{self, NETWORK_PREFIX, Policy, PolicyConfig},
 };
+use emp_motion::atomic;
 use emp_robot::Robot;
 use emp_sim::{
     End, Rollout,
@@ -452,7 +453,7 @@ pub fn train(
     trainer.save_run(&run.files.checkpoint(), run.source)?;
     let best = run.files.best();
     let weights = std::fs::read(&best).with_context(|| format!("reading {}", best.display()))?;
-    write_atomically(&run.files.weights, &weights)
+    atomic::write(&run.files.weights, &weights)
         .with_context(|| format!("writing {}", run.files.weights.display()))?;
     bar.finish();
     Ok(Outcome::Finished)

@@ -3,7 +3,7 @@
 use std::{fmt, path::Path};
 
 use anyhow::{Context as _, Result, anyhow};
-use emp_models::checkpoint::write_atomically;
+use emp_motion::atomic;
 use plotters::{
     coord::Shift,
     prelude::{
@@ -53,7 +53,7 @@ pub fn draw(report: &EmpReport, out: &Path) -> Result<()> {
         }
         area.present().map_err(failed)?;
     }
-    write_atomically(out, svg.as_bytes()).with_context(|| format!("writing {}", out.display()))
+    atomic::write(out, svg.as_bytes()).with_context(|| format!("writing {}", out.display()))
 }
 
 /// The families in the order of the rows, without the policy alone.

@@ -6,10 +6,11 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use emp_client::{Client, EmpMode, EvaluateConfig, EvaluationEvent, MassRange, Push};
 use emp_robot::Robot;
+use emp_sim::pushes::Kick;
 use serde::Serialize;
 
-use crate::conditions::{Conditions, Pushes, SHORT_PUSH_INTERVAL};
 use crate::control::{self, Pace, Run};
+use crate::disturbances::{Disturbances, SHORT_PUSH_INTERVAL};
 use crate::episode::{Episode, tilt};
 use crate::hard::HardMotions;
 use crate::motion::Motion;
@@ -31,7 +32,7 @@ pub(crate) struct Trials {
 /// One motion, played with the EMP off, and on where the robot has one.
 pub(crate) struct Comparison {
     pub(crate) motion: Motion,
-    pub(crate) conditions: Conditions,
+    pub(crate) disturbances: Disturbances,
     pub(crate) off: Run,
     pub(crate) on: Option<Run>,
     /// Number of the motion, from 1.
@@ -85,7 +86,7 @@ impl Trials {
             off,
             on,
         } = self.telling(client, robot, has_emp).await?;
-        let conditions = self.conditions(robot, number);
+        let disturbances = self.disturbances(robot, number);
         eprintln!("counting falls over {} motions", self.motions.sources.len());
         let mut counts = Vec::new();
         for mode in [EvaluatedMode::Off, EvaluatedMode::On] {
@@ -95,7 +96,7 @@ impl Trials {
         }
         Ok(Comparison {
             motion,
-            conditions,
+            disturbances,
             off,
             on,
             number: number + 1,
@@ -163,12 +164,12 @@ impl Trials {
         motion: &Motion,
         mode: EmpMode,
     ) -> Result<Run> {
-        let conditions = self.conditions(robot, number);
+        let disturbances = self.disturbances(robot, number);
         control::run(
             client,
             robot,
             &motion.clip,
-            conditions,
+            disturbances,
             mode,
             Pace::LockStep,
         )
@@ -176,13 +177,13 @@ impl Trials {
     }
 
     /// Loads and pushes of a motion, which follow from the seed and its number.
-    fn conditions(&self, robot: &Robot, number: usize) -> Conditions {
-        let pushes = Pushes {
+    fn disturbances(&self, robot: &Robot, number: usize) -> Disturbances {
+        let pushes = Kick {
             speed: self.push,
             interval: SHORT_PUSH_INTERVAL,
         };
         let seed = self.seed.wrapping_add(number as u64);
-        Conditions::new(robot, seed, self.load, pushes)
+        Disturbances::new(robot, seed, self.load, pushes)
     }
 
     /// Falls over all motions.
@@ -313,8 +314,8 @@ impl Comparison {
             number: self.number,
             amplitude: self.amplitude,
             seconds: self.motion.time(self.motion.clip.frames.len()),
-            hand_load_kg: self.conditions.hand_load,
-            push_m_per_s: self.conditions.pushes.speed,
+            hand_load_kg: self.disturbances.hand_load,
+            push_m_per_s: self.disturbances.pushes.speed,
             off: Episode::new(robot, &self.off),
             on: on.map(|run| Episode::new(robot, run)),
             joints: on.map_or_else(Vec::new, |run| joint_changes(robot, run)),

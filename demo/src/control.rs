@@ -11,7 +11,7 @@ use emp_sim::Reading;
 use emp_sim::environment::{EndReason, EnvironmentConfig};
 use tokio::time::{Instant, sleep_until, timeout_at};
 
-use crate::conditions::Conditions;
+use crate::disturbances::Disturbances;
 use crate::simulator::Simulator;
 use crate::teleoperation::{Answered, Teleoperation};
 
@@ -57,7 +57,7 @@ pub(crate) async fn run(
     client: &Client,
     robot: &Arc<Robot>,
     clip: &Clip,
-    mut conditions: Conditions,
+    mut disturbances: Disturbances,
     emp_mode: EmpMode,
     pace: Pace,
 ) -> Result<Run> {
@@ -65,7 +65,7 @@ pub(crate) async fn run(
     let mut server = Teleoperation::start(client, robot, emp_mode).await?;
     let mut last = Answered::resting(robot);
     let goal = last.targets.goal.clone();
-    let (mut simulator, start) = Simulator::start(robot, conditions.hand_load, &goal).await?;
+    let (mut simulator, start) = Simulator::start(robot, disturbances.hand_load, &goal).await?;
 
     let limits = EnvironmentConfig::default();
     let length = Duration::from_secs_f64(1.0 / robot.control_rate_hz());
@@ -88,7 +88,7 @@ pub(crate) async fn run(
         let round_trip = woke.elapsed();
         let answered = answer.is_some();
         last = answer.unwrap_or_else(|| last.again());
-        let push = conditions.push(number);
+        let push = disturbances.push(number);
         let reading = simulator.step(last.targets.clone(), push).await?;
         fall = limits.fall(&reading, robot.standing_height());
         periods.push(Period {

@@ -3,6 +3,7 @@
 use std::f64::consts::TAU;
 
 use emp_robot::Robot;
+use emp_sim::pushes::Kick;
 use nalgebra::Vector3;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -11,29 +12,21 @@ use rand_chacha::ChaCha8Rng;
 pub(crate) const PUSH_INTERVAL: f64 = 5.0;
 pub(crate) const SHORT_PUSH_INTERVAL: f64 = 1.5;
 
-/// Pushes of the base.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Pushes {
-    /// What a push adds to the base's speed, m/s; 0: there are none.
-    pub(crate) speed: f64,
-    /// Time between two pushes, seconds.
-    pub(crate) interval: f64,
-}
-
 /// What follows from the seed.
 #[derive(Clone, Debug)]
-pub(crate) struct Conditions {
+pub(crate) struct Disturbances {
     /// Mass added to the left and the right hand, kg.
     pub(crate) hand_load: [f64; 2],
-    pub(crate) pushes: Pushes,
+    /// Pushes of the base; a speed of 0 is none.
+    pub(crate) pushes: Kick,
     push_directions: ChaCha8Rng,
     /// Frames between two pushes.
     push_interval: usize,
 }
 
-impl Conditions {
+impl Disturbances {
     /// Draws the loads from the robot's range for tests, unless `load` says how much both hands carry, kg.
-    pub(crate) fn new(robot: &Robot, seed: u64, load: Option<f64>, pushes: Pushes) -> Self {
+    pub(crate) fn new(robot: &Robot, seed: u64, load: Option<f64>, pushes: Kick) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let [low, high] = robot.added_masses().test_hand;
         let drawn = [0, 1].map(|_| rng.random_range(low..=high));
@@ -69,13 +62,13 @@ mod tests {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../robots/emp27");
         let robot = Robot::load(&folder).unwrap();
         let [low, high] = robot.added_masses().test_hand;
-        let pushes = |speed| Pushes {
+        let pushes = |speed| Kick {
             speed,
             interval: PUSH_INTERVAL,
         };
         for seed in 0..20 {
             let [mut first, mut second] =
-                [0, 1].map(|_| Conditions::new(&robot, seed, None, pushes(0.3)));
+                [0, 1].map(|_| Disturbances::new(&robot, seed, None, pushes(0.3)));
             assert_eq!(first.hand_load, second.hand_load);
             assert!(
                 first
@@ -90,7 +83,7 @@ mod tests {
                 assert!(push.is_none_or(|push| (push.norm() - 0.3).abs() < 1e-12));
             }
         }
-        let mut loaded = Conditions::new(&robot, 1, Some(2.0), pushes(0.0));
+        let mut loaded = Disturbances::new(&robot, 1, Some(2.0), pushes(0.0));
         assert_eq!(loaded.hand_load, [2.0; 2]);
         assert!((0..600).all(|frame| loaded.push(frame).is_none()));
     }

@@ -215,8 +215,7 @@ fn mode_name(mode: EmpMode) -> String {
 /// The paper's metrics, as the evaluation computes them.
 fn metrics(robot: &Robot, run: &Run) -> Metrics<f64> {
     let mut sums = EpisodeSums::default();
-    let joints = robot.goal_joints().iter();
-    let default: Vec<f32> = joints.map(|joint| joint.default as f32).collect();
+    let default: Vec<f32> = robot.default_goal();
     let readings = run.periods.iter().map(|period| &period.reading);
     let before = std::iter::once(&run.start).chain(readings);
     for (period, before) in run.periods.iter().zip(before) {

@@ -9,8 +9,8 @@
 #![forbid(unsafe_code)]
 
 mod comparison;
-mod conditions;
 mod control;
+mod disturbances;
 mod episode;
 mod folders;
 mod hard;
@@ -38,11 +38,12 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::Parser;
 use emp_client::{Client, EmpMode};
 use emp_robot::Robot;
+use emp_sim::pushes::Kick;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::comparison::{Comparison, Trials};
-use crate::conditions::{Conditions, PUSH_INTERVAL, Pushes};
 use crate::control::{Pace, Run};
+use crate::disturbances::{Disturbances, PUSH_INTERVAL};
 use crate::folders::Folders;
 use crate::hard::HardMotions;
 use crate::measure::Summary;
@@ -119,12 +120,12 @@ fn run(options: &Options) -> Result<()> {
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot make {}", options.out.display()))?;
 
-    let pushes = Pushes {
+    let pushes = Kick {
         speed: options.push,
         interval: PUSH_INTERVAL,
     };
     let demo = Arc::new(Demo {
-        conditions: Conditions::new(&robot, options.seed, options.load, pushes),
+        disturbances: Disturbances::new(&robot, options.seed, options.load, pushes),
         trials: trials(options, &motion),
         seed: options.seed,
         robot: Arc::new(robot),
@@ -182,7 +183,7 @@ struct Demo {
     robot: Arc<Robot>,
     motion: Motion,
     seed: u64,
-    conditions: Conditions,
+    disturbances: Disturbances,
     trials: Option<Trials>,
     out: PathBuf,
     #[cfg(feature = "render")]
@@ -234,10 +235,10 @@ impl Demo {
 
     /// The motion in real time, with the EMP off: what it does is shown on a hard motion.
     async fn follow(&self, client: &Client) -> Result<Run> {
-        let conditions = self.conditions.clone();
+        let disturbances = self.disturbances.clone();
         let mode = EmpMode::Off;
         let (robot, clip) = (&self.robot, &self.motion.clip);
-        control::run(client, robot, clip, conditions, mode, Pace::RealTime).await
+        control::run(client, robot, clip, disturbances, mode, Pace::RealTime).await
     }
 
     /// Measures, draws, and writes everything down.
@@ -249,11 +250,11 @@ impl Demo {
             .zip(hard_motion.as_ref())
             .map(|(comparison, summary)| side_by_side::sheet(robot, comparison, summary))
             .transpose()?;
-        let conditions = (self.seed, &self.conditions);
+        let disturbances = (self.seed, &self.disturbances);
         let (summary, errors) = measure::summary(
             robot,
             motion,
-            conditions,
+            disturbances,
             models,
             run,
             &postures,

@@ -10,8 +10,8 @@ use nalgebra::Vector3;
 use serde::Serialize;
 
 use crate::comparison::ComparisonSummary;
-use crate::conditions::Conditions;
 use crate::control::Run;
+use crate::disturbances::Disturbances;
 use crate::episode::{Episode, percent, percentile};
 use crate::hard::goal_poses;
 use crate::models::Models;
@@ -34,7 +34,7 @@ pub(crate) struct Summary {
     motion: String,
     /// Length of the motion, seconds.
     seconds: f64,
-    /// Seed of the conditions.
+    /// Seed of the disturbances.
     seed: u64,
     /// Mass added to the left and the right hand, kg.
     hand_load_kg: [f64; 2],
@@ -73,7 +73,7 @@ struct Spread {
 pub(crate) fn summary(
     robot: &Robot,
     motion: &Motion,
-    (seed, conditions): (u64, &Conditions),
+    (seed, disturbances): (u64, &Disturbances),
     models: Models,
     run: &Run,
     postures: &[Posture],
@@ -98,8 +98,8 @@ pub(crate) fn summary(
         motion: motion.name.clone(),
         seconds: motion.time(human.len()),
         seed,
-        hand_load_kg: conditions.hand_load,
-        push_m_per_s: conditions.pushes.speed,
+        hand_load_kg: disturbances.hand_load,
+        push_m_per_s: disturbances.pushes.speed,
         models,
         episode: Episode::new(robot, run),
         direction_error_deg: Spread::of(asked.as_flattened()),

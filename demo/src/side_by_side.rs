@@ -10,8 +10,8 @@ use crate::episode::tilt;
 use crate::picture::{Curve, EmpSheet, JointCurves, OFF, ON, Standing, Strip};
 use crate::posture::{Posture, postures};
 
-/// How many moments are shown, and the time between two of them before a fall, seconds.
-const MOMENTS: usize = 6;
+/// How many stills are shown, and the time between two of them before a fall, seconds.
+const STILLS: usize = 6;
 const SPACING: f64 = 0.4;
 /// How many joints are shown.
 const JOINTS: usize = 3;
@@ -27,12 +27,12 @@ pub(crate) fn sheet(
     } = comparison;
     let rate = robot.control_rate_hz();
     let frames = motion.clip.frames.len();
-    let moments = moments(frames, off, rate);
+    let stills = stills(frames, off, rate);
     let runs = std::iter::once(("EMP off", OFF, off)).chain(on.iter().map(|on| ("EMP on", ON, on)));
     let strips = runs
         .zip(summary.outcomes())
         .map(|((name, color, run), outcome)| {
-            let figures = figures(robot, run, &moments)?;
+            let figures = figures(robot, run, &stills)?;
             let (tilt, margin) = stance(run, rate);
             Ok(Strip {
                 name,
@@ -52,8 +52,8 @@ pub(crate) fn sheet(
         .collect();
     let runs = std::iter::once(off).chain(on);
     let longest = runs.max_by_key(|run| run.periods.len()).unwrap_or(off);
-    let times: Vec<f64> = moments.iter().map(|&frame| motion.time(frame)).collect();
-    let person: Vec<_> = moments
+    let times: Vec<f64> = stills.iter().map(|&frame| motion.time(frame)).collect();
+    let person: Vec<_> = stills
         .iter()
         .map(|&frame| motion.clip.frames[frame].clone())
         .collect();
@@ -80,16 +80,16 @@ fn pushes(run: &Run, rate: f64) -> Vec<f64> {
 }
 
 /// Frames to show: the last ones before the fall without the EMP, or else some over the whole motion.
-fn moments(frames: usize, off: &Run, rate: f64) -> Vec<usize> {
+fn stills(frames: usize, off: &Run, rate: f64) -> Vec<usize> {
     let last = off.periods.len().min(frames).saturating_sub(1);
-    let before = |number: usize| (MOMENTS - 1 - number) as f64;
+    let before = |number: usize| (STILLS - 1 - number) as f64;
     let frame = |number: usize| match off.fall {
         Some(_) => last.saturating_sub((before(number) * SPACING * rate).round() as usize),
-        None => (last as f64 * (number as f64 + 0.5) / MOMENTS as f64) as usize,
+        None => (last as f64 * (number as f64 + 0.5) / STILLS as f64) as usize,
     };
-    let mut moments: Vec<usize> = (0..MOMENTS).map(frame).collect();
-    moments.dedup();
-    moments
+    let mut stills: Vec<usize> = (0..STILLS).map(frame).collect();
+    stills.dedup();
+    stills
 }
 
 /// The robot in each of the frames; in its last one where it had fallen by then.

@@ -97,7 +97,7 @@ fn place(robot: &Robot, angles: &[f64], parameters: BodyParameters) -> Result<(S
     Ok((stage, body))
 }
 
-/// Does what it is told until nobody tells or listens any more.
+/// Executes commands until the other side is gone.
 fn simulate(
     mut stage: Stage,
     mut body: Body,

@@ -8,7 +8,7 @@ use emp_client::{
     TeleoperationConfig, TeleoperationFrame,
 };
 use emp_motion::KeyNodeFrame;
-use emp_robot::{Joint, Robot};
+use emp_robot::Robot;
 use emp_sim::Reading;
 
 use crate::simulator::JointTargets;
@@ -36,16 +36,13 @@ pub(crate) struct Answered {
 impl Answered {
     /// A robot in its default pose that was not told anything yet.
     pub(crate) fn resting(robot: &Robot) -> Self {
-        let angles = |joints: &[Joint]| -> Vec<f32> {
-            joints.iter().map(|joint| joint.default as f32).collect()
-        };
-        let goal = angles(robot.goal_joints());
+        let goal = robot.default_goal();
         Self {
             person: goal.clone(),
             goal: goal.clone(),
             targets: JointTargets {
                 goal,
-                legs: angles(robot.leg_joints()),
+                legs: robot.default_legs(),
             },
             emp_mode: EmpMode::Unspecified,
             margin: None,

@@ -165,12 +165,8 @@ fn reasons(
     asked: Option<NearestLinks>,
     executable: Option<NearestLinks>,
 ) -> Vec<Reason> {
-    let inside: Vec<f32> = robot
-        .goal_joints()
-        .iter()
-        .zip(goal.asked)
-        .map(|(joint, angle)| angle.clamp(joint.range[0] as f32, joint.range[1] as f32))
-        .collect();
+    let mut inside = goal.asked.to_vec();
+    robot.clamp_goal(&mut inside);
     let was_outside = |(asked, (inside, executable)): (&f32, (&f32, &f32))| {
         asked != inside && is_change(&(executable - asked))
     };

@@ -27,6 +27,14 @@ pub struct Joint {
     pub dof_address: usize,
 }
 
+impl Joint {
+    /// The nearest angle inside the joint's range, rad.
+    pub fn clamp(&self, angle: f32) -> f32 {
+        let [lower, upper] = self.range.map(|limit| limit as f32);
+        angle.clamp(lower, upper)
+    }
+}
+
 /// A goal joint as a node of the robot's joint graph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GoalNode {

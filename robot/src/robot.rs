@@ -127,6 +127,30 @@ impl Robot {
         &self.goal_tree
     }
 
+    /// Default angles of all joints, in the order of [`joints`](Self::joints), rad.
+    pub fn default_pose(&self) -> Vec<f32> {
+        self.joints().map(|joint| joint.default as f32).collect()
+    }
+
+    /// Default angles of the goal joints, rad.
+    pub fn default_goal(&self) -> Vec<f32> {
+        let joints = self.goal_joints.iter();
+        joints.map(|joint| joint.default as f32).collect()
+    }
+
+    /// Default angles of the leg joints, rad.
+    pub fn default_legs(&self) -> Vec<f32> {
+        let joints = self.leg_joints.iter();
+        joints.map(|joint| joint.default as f32).collect()
+    }
+
+    /// Moves each angle of a goal (rad, goal order) into its joint's range.
+    pub fn clamp_goal(&self, goal: &mut [f32]) {
+        for (angle, joint) in goal.iter_mut().zip(&self.goal_joints) {
+            *angle = joint.clamp(*angle);
+        }
+    }
+
     /// How often joint targets change, Hz.
     pub fn control_rate_hz(&self) -> f64 {
         self.config.control.rate_hz

@@ -269,11 +269,7 @@ fn tracking(
 
 /// Goals that stay at the default pose.
 fn standing(robot: &Robot) -> GoalLibrary {
-    let rest: Vec<f32> = robot
-        .goal_joints()
-        .iter()
-        .map(|joint| joint.default as f32)
-        .collect();
+    let rest: Vec<f32> = robot.default_goal();
     let clip = GoalClip::new(robot, "rest", Source::Procedural, &vec![rest; 100]);
     GoalLibrary::new(robot, vec![clip.expect("a clip")]).expect("a library")
 }

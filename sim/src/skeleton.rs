@@ -142,7 +142,7 @@ mod tests {
     #[test]
     fn legs_run_from_the_hip_down_to_the_toes() {
         for_each_robot(|robot| {
-            let angles: Vec<f32> = robot.joints().map(|joint| joint.default as f32).collect();
+            let angles: Vec<f32> = robot.default_pose();
             let pose = Skeleton::new(robot).unwrap().pose(&angles);
             for (leg, side) in pose.legs.iter().zip([1.0, -1.0]) {
                 let [hip, .., heel, toes] = leg.as_slice() else {

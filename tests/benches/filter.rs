@@ -251,7 +251,7 @@ async fn check(reference: &Reference, emp: &Emp, calls: &Calls) -> anyhow::Resul
     let stack = &calls.numbers[..emp.config().observation.width()];
     let ours = &emp.answer(stack)?[0].goal;
     for ((joint, ours), theirs) in calls.robot.goal_joints().iter().zip(ours).zip(theirs) {
-        let theirs = theirs.clamp(joint.range[0] as f32, joint.range[1] as f32);
+        let theirs = joint.clamp(theirs);
         anyhow::ensure!(
             (ours - theirs).abs() < TOLERANCE,
             "{}: {ours} rad here, {theirs} rad there",

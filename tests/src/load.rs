@@ -43,7 +43,7 @@ pub async fn teleoperate(client: &Client, emp_mode: EmpMode) -> anyhow::Result<V
             bail!("a pose without an answer")
         };
         let state = RobotFrame {
-            joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
+            joint_positions: robot.default_pose(),
             orientation: UnitQuaternion::identity(),
             goal: goal.joint_angles,
             reset: false,

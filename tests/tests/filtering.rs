@@ -140,7 +140,7 @@ fn episode(robot: &Robot) -> Vec<GoalFrame> {
         let swing = |start: f32| 0.3 * (0.1 * time + start).sin();
         let inside = |(i, joint): (usize, &emp_robot::Joint)| {
             let angle = joint.default as f32 + swing(i as f32);
-            angle.clamp(joint.range[0] as f32, joint.range[1] as f32)
+            joint.clamp(angle)
         };
         let goals = robot.goal_joints().iter().enumerate().map(inside);
         GoalFrame {

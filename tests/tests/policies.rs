@@ -91,15 +91,13 @@ fn record(controller: &Controller) -> anyhow::Result<Episode> {
 fn goal(robot: &Robot, offset: f32) -> Vec<f32> {
     let joints = robot.goal_joints().iter();
     joints
-        .map(|joint| {
-            (joint.default as f32 + offset).clamp(joint.range[0] as f32, joint.range[1] as f32)
-        })
+        .map(|joint| joint.clamp(joint.default as f32 + offset))
         .collect()
 }
 
 fn rest(robot: &Robot) -> RobotFrame {
     RobotFrame {
-        joint_positions: robot.joints().map(|joint| joint.default as f32).collect(),
+        joint_positions: robot.default_pose(),
         orientation: UnitQuaternion::identity(),
         goal: goal(robot, 0.1),
         reset: false,

@@ -83,7 +83,7 @@ pub(crate) struct Strip {
     pub(crate) fall: Option<f64>,
 }
 
-/// A robot at one moment.
+/// A robot at one still.
 pub(crate) struct Standing {
     /// Its key nodes in the frame of its base.
     pub(crate) pose: KeyNodeFrame,
@@ -114,7 +114,7 @@ impl EmpSheet<'_> {
     /// If there is nothing to draw.
     pub(crate) fn png(&self) -> Result<Vec<u8>> {
         ensure!(!self.strips.is_empty(), "there is no run to draw");
-        ensure!(!self.times.is_empty(), "there is no moment to draw");
+        ensure!(!self.times.is_empty(), "there is no still to draw");
         let rows = Rows::new(self);
         let charts_top = HEADER + rows.height() + CHART_GAP;
         let joints = self.joints.len() as f32;
@@ -158,7 +158,7 @@ impl EmpSheet<'_> {
         let largest = values.map(|(_, value)| *value).fold(0.0, f32::max);
         let end = (1.08 * largest).clamp(TILT_AXIS[0], TILT_AXIS[1]);
         let title = "tilt of the base, degrees";
-        // Below 0 there is room for the moments' numbers.
+        // Below 0 there is room for the stills' numbers.
         let chart = self.chart(canvas, place, [-0.14 * end, end], title);
         self.runs(canvas, &chart, |strip| strip.tilt.clone());
         chart
@@ -216,7 +216,7 @@ impl EmpSheet<'_> {
         }
     }
 
-    /// An empty chart with lines at the moments, the pushes and the falls.
+    /// An empty chart with lines at the stills, the pushes and the falls.
     fn chart(&self, canvas: &mut Canvas, place: [Point; 2], range: [f32; 2], title: &str) -> Chart {
         let chart = Chart::new(canvas, place, [0.0, self.seconds as f32], range, title);
         for &time in self.times {
@@ -342,7 +342,7 @@ impl Row {
 
 /// The line at the top of a cell.
 enum Caption<'a> {
-    /// Number of the moment, and when it is.
+    /// Number of the still, and when it is.
     Time(usize, f64),
     Robot(&'a Standing),
 }
@@ -422,18 +422,18 @@ fn left(column: usize, columns: usize) -> f32 {
 mod tests {
     use tiny_skia::Pixmap;
 
-    use super::super::testing::moment;
+    use super::super::testing::still;
     use super::*;
 
     const TIMES: [f64; 3] = [0.5, 1.0, 1.5];
 
     fn strip(name: &'static str, color: Rgb, fall: Option<f64>) -> Strip {
         let figures = TIMES.map(|time| {
-            let moment = moment(time);
+            let still = still(time);
             Standing {
-                pose: moment.robot,
-                legs: moment.legs,
-                base: moment.stance.base,
+                pose: still.robot,
+                legs: still.legs,
+                base: still.stance.base,
                 tilt: 1.0,
                 fallen: fall.filter(|fall| *fall <= time),
             }
@@ -467,7 +467,7 @@ mod tests {
             title: "title",
             subtitles: &["one".to_owned(), "two".to_owned()],
             times: &TIMES,
-            person: &TIMES.map(|time| moment(time).human),
+            person: &TIMES.map(|time| still(time).human),
             strips,
             joints: &joints,
             seconds: 4.0,

@@ -4,9 +4,9 @@ mod canvas;
 mod chart;
 mod emp_sheet;
 mod figure;
-mod moments;
 mod sheet;
 mod stance_sheet;
+mod stills;
 #[cfg(test)]
 mod testing;
 mod view;
@@ -17,12 +17,12 @@ use crate::stance::Stance;
 use figure::{Figure, Leg};
 
 pub(crate) use emp_sheet::{Curve, EmpSheet, JointCurves, OFF, ON, Standing, Strip};
-pub(crate) use moments::differing;
 pub(crate) use sheet::Sheet;
 pub(crate) use stance_sheet::StanceSheet;
+pub(crate) use stills::differing;
 
-/// One moment of the motion.
-pub(crate) struct Moment {
+/// One frame of the motion, as the pictures show it.
+pub(crate) struct Still {
     /// Since the motion began, seconds.
     pub(crate) time: f64,
     /// What is going on, if that has a name.
@@ -39,7 +39,7 @@ pub(crate) struct Moment {
     pub(crate) stance: Stance,
 }
 
-impl Moment {
+impl Still {
     /// The robot in the frame of its base.
     fn robot_figure(&self) -> Figure {
         Figure::robot(&self.robot, &self.legs)

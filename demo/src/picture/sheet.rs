@@ -1,9 +1,9 @@
-//! The contact sheet: the person above the robot at moments that differ.
+//! The contact sheet: the person above the robot at stills that differ.
 
 use anyhow::{Result, ensure};
 use nalgebra::{Isometry3, Translation3};
 
-use super::Moment;
+use super::Still;
 use super::canvas::{Align, Canvas, Point};
 use super::figure::Figure;
 use super::view::{BACKGROUND, Bounds, Camera, FAINT, GROUND, INK, LEFT, PANEL, RIGHT, View};
@@ -26,24 +26,24 @@ pub(crate) struct Sheet<'a> {
     /// Second line of the head.
     pub(crate) subtitle: &'a str,
     /// What is shown, in order.
-    pub(crate) moments: &'a [Moment],
+    pub(crate) stills: &'a [Still],
 }
 
 impl Sheet<'_> {
     /// Draws the sheet; the answer is a PNG file.
     pub(crate) fn png(&self) -> Result<Vec<u8>> {
-        ensure!(!self.moments.is_empty(), "there is no moment to draw");
+        ensure!(!self.stills.is_empty(), "there is no still to draw");
         let camera = Camera::front_left();
         let pairs: Vec<[View; 2]> = self
-            .moments
+            .stills
             .iter()
-            .map(|moment| moment.views(&camera))
+            .map(|still| still.views(&camera))
             .collect();
         let layout = Layout::new(&pairs);
         let mut canvas = Canvas::new(layout.width as u32, layout.height as u32, BACKGROUND)?;
         self.header(&mut canvas, layout.width);
-        for (index, (moment, views)) in self.moments.iter().zip(&pairs).enumerate() {
-            layout.draw(&mut canvas, index, moment, views);
+        for (index, (still, views)) in self.stills.iter().zip(&pairs).enumerate() {
+            layout.draw(&mut canvas, index, still, views);
         }
         canvas.png()
     }
@@ -63,7 +63,7 @@ impl Sheet<'_> {
     }
 }
 
-impl Moment {
+impl Still {
     fn views(&self, camera: &Camera) -> [View; 2] {
         let human = Figure::person(&self.human);
         let tilt = Isometry3::from_parts(Translation3::identity(), self.stance.base.rotation);
@@ -113,7 +113,7 @@ impl Layout {
         }
     }
 
-    fn draw(&self, canvas: &mut Canvas, index: usize, moment: &Moment, [human, robot]: &[View; 2]) {
+    fn draw(&self, canvas: &mut Canvas, index: usize, still: &Still, [human, robot]: &[View; 2]) {
         let Band {
             top,
             height,
@@ -133,7 +133,7 @@ impl Layout {
             0.0,
             PANEL,
         );
-        caption(canvas, (left, *top), moment);
+        caption(canvas, (left, *top), still);
 
         let middle = left + CELL_WIDTH / 2.0;
         let human_top = top + CAPTION + PADDING;
@@ -191,7 +191,7 @@ impl Band {
     }
 }
 
-fn caption(canvas: &mut Canvas, (left, top): Point, moment: &Moment) {
+fn caption(canvas: &mut Canvas, (left, top): Point, still: &Still) {
     let right = left + CELL_WIDTH - INSET;
     let line = top + 36.0;
     canvas.text(
@@ -199,10 +199,10 @@ fn caption(canvas: &mut Canvas, (left, top): Point, moment: &Moment) {
         27.0,
         Align::Left,
         INK,
-        &format!("{:.1} s", moment.time),
+        &format!("{:.1} s", still.time),
     );
-    canvas.text((right, line), 27.0, Align::Right, INK, &moment.name);
-    let error = format!("arm directions {:.1}° apart", moment.direction_error_deg);
+    canvas.text((right, line), 27.0, Align::Right, INK, &still.name);
+    let error = format!("arm directions {:.1}° apart", still.direction_error_deg);
     canvas.text(
         (left + INSET, line + 28.0),
         21.0,
@@ -217,14 +217,14 @@ mod tests {
     use tiny_skia::Pixmap;
 
     use super::super::canvas::Rgb;
-    use super::super::testing::moment;
+    use super::super::testing::still;
     use super::*;
 
-    fn draw(moments: &[Moment]) -> Pixmap {
+    fn draw(stills: &[Still]) -> Pixmap {
         let png = Sheet {
             title: "title",
             subtitle: "subtitle",
-            moments,
+            stills,
         }
         .png()
         .unwrap();
@@ -233,7 +233,7 @@ mod tests {
 
     #[test]
     fn left_is_drawn_on_the_right_of_a_figure_that_faces_us() {
-        let pixels = draw(&[moment(0.0)]);
+        let pixels = draw(&[still(0.0)]);
         let center = |rgb: Rgb| {
             let columns =
                 (0..pixels.height()).flat_map(|y| (0..pixels.width()).map(move |x| (x, y)));
@@ -253,9 +253,9 @@ mod tests {
     }
 
     #[test]
-    fn the_sheet_grows_with_its_moments() {
-        let moments: Vec<Moment> = (0..5).map(|index| moment(f64::from(index))).collect();
-        let [one, four, five] = [1, 4, 5].map(|count| draw(&moments[..count]));
+    fn the_sheet_grows_with_its_stills() {
+        let stills: Vec<Still> = (0..5).map(|index| still(f64::from(index))).collect();
+        let [one, four, five] = [1, 4, 5].map(|count| draw(&stills[..count]));
         assert!(one.width() < four.width() && four.width() == five.width());
         assert!(five.height() > four.height() + 400);
     }
@@ -266,7 +266,7 @@ mod tests {
             Sheet {
                 title: "",
                 subtitle: "",
-                moments: &[]
+                stills: &[]
             }
             .png()
             .is_err()

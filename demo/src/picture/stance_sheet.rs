@@ -1,9 +1,9 @@
-//! The stance sheet: the robot from its right side at some moments, and below how it stood over the whole run.
+//! The stance sheet: the robot from its right side at some stills, and below how it stood over the whole run.
 
 use anyhow::{Result, ensure};
 use nalgebra::Vector3;
 
-use super::Moment;
+use super::Still;
 use super::canvas::{Align, Canvas, Point, Rgb};
 use super::chart::{Chart, tag};
 use super::view::{BACKGROUND, Bounds, Camera, FAINT, GROUND, INK, LEFT, PANEL, RIGHT, View};
@@ -45,7 +45,7 @@ pub(crate) struct StanceSheet<'a> {
     /// Second line of the head.
     pub(crate) subtitle: &'a str,
     /// What is shown, in order.
-    pub(crate) moments: &'a [Moment],
+    pub(crate) stills: &'a [Still],
     /// How the robot stood, frame by frame.
     pub(crate) stances: &'a [Stance],
     /// Frames a second.
@@ -59,16 +59,16 @@ pub(crate) struct StanceSheet<'a> {
 impl StanceSheet<'_> {
     /// Draws the sheet; the answer is a PNG file.
     pub(crate) fn png(&self) -> Result<Vec<u8>> {
-        ensure!(!self.moments.is_empty(), "there is no moment to draw");
+        ensure!(!self.stills.is_empty(), "there is no still to draw");
         ensure!(!self.stances.is_empty(), "there is no frame to draw");
-        let cells = Cells::new(self.moments);
+        let cells = Cells::new(self.stills);
         let width = 2.0 * MARGIN + COLUMNS as f32 * (CELL_WIDTH + GAP) - GAP;
         let charts_top = HEADER + cells.rows as f32 * (cells.height + GAP);
         let height = charts_top + 3.0 * (CHART + GAP) - GAP + AXIS + MARGIN / 2.0;
         let mut canvas = Canvas::new(width as u32, height as u32, BACKGROUND)?;
         self.header(&mut canvas, width);
-        for (index, moment) in self.moments.iter().enumerate() {
-            cells.draw(&mut canvas, index, moment);
+        for (index, still) in self.stills.iter().enumerate() {
+            cells.draw(&mut canvas, index, still);
         }
         self.charts(&mut canvas, charts_top, width);
         canvas.png()
@@ -97,8 +97,8 @@ impl StanceSheet<'_> {
             self.forward_chart(canvas, places[1]),
             self.sideways_chart(canvas, places[2]),
         ];
-        for (number, moment) in self.moments.iter().enumerate() {
-            charts[0].tag(canvas, moment.time as f32, &format!("{}", number + 1));
+        for (number, still) in self.stills.iter().enumerate() {
+            charts[0].tag(canvas, still.time as f32, &format!("{}", number + 1));
         }
         charts[2].time_axis(canvas);
     }
@@ -169,10 +169,10 @@ impl StanceSheet<'_> {
         chart
     }
 
-    /// Lines at the moments, the pushes and the fall.
+    /// Lines at the stills, the pushes and the fall.
     fn rules(&self, canvas: &mut Canvas, chart: &Chart) {
-        for moment in self.moments {
-            chart.rule(canvas, moment.time as f32, 1.2, GROUND);
+        for still in self.stills {
+            chart.rule(canvas, still.time as f32, 1.2, GROUND);
         }
         for &push in self.pushes {
             chart.rule(canvas, push as f32, 2.0, FAINT);
@@ -202,7 +202,7 @@ fn axis<'a>(
     [-end, end]
 }
 
-/// The cells of the moments: all of one size, and of one scale.
+/// The cells of the stills: all of one size, and of one scale.
 struct Cells {
     camera: Camera,
     views: Vec<View>,
@@ -213,13 +213,13 @@ struct Cells {
 }
 
 impl Cells {
-    fn new(moments: &[Moment]) -> Self {
+    fn new(stills: &[Still]) -> Self {
         let camera = Camera::right_side();
-        let view = |moment: &Moment| {
-            let robot = moment.robot_figure().placed(&moment.stance.base);
+        let view = |still: &Still| {
+            let robot = still.robot_figure().placed(&still.stance.base);
             View::new(&robot, &camera)
         };
-        let views: Vec<View> = moments.iter().map(view).collect();
+        let views: Vec<View> = stills.iter().map(view).collect();
         let bounds = views
             .iter()
             .fold(Bounds::NONE, |bounds, view| bounds.union(view.bounds))
@@ -232,16 +232,16 @@ impl Cells {
             bounds,
             scale,
             height: CAPTION + PADDING + bounds.top * scale + CELLAR,
-            rows: moments.len().div_ceil(COLUMNS),
+            rows: stills.len().div_ceil(COLUMNS),
         }
     }
 
-    fn draw(&self, canvas: &mut Canvas, index: usize, moment: &Moment) {
+    fn draw(&self, canvas: &mut Canvas, index: usize, still: &Still) {
         let left = MARGIN + (index % COLUMNS) as f32 * (CELL_WIDTH + GAP);
         let top = HEADER + (index / COLUMNS) as f32 * (self.height + GAP);
         let (right, bottom) = (left + CELL_WIDTH, top + self.height);
         rectangle(canvas, [(left, top), (right, bottom)], PANEL);
-        caption(canvas, (left, top), index + 1, moment);
+        caption(canvas, (left, top), index + 1, still);
 
         let floor = bottom - CELLAR;
         let width = (self.bounds.right - self.bounds.left) * self.scale;
@@ -252,7 +252,7 @@ impl Cells {
         self.views[index].draw(canvas, origin, self.scale);
         rectangle(canvas, [(left, floor), (right, bottom)], UNDER_FEET);
         canvas.line(&[(left, floor), (right, floor)], 2.0, GROUND);
-        self.balance(canvas, origin, &moment.stance);
+        self.balance(canvas, origin, &still.stance);
     }
 
     /// The centre of mass, and below the floor where it is against the feet.
@@ -288,18 +288,18 @@ impl Cells {
     }
 }
 
-fn caption(canvas: &mut Canvas, (left, top): Point, number: usize, moment: &Moment) {
+fn caption(canvas: &mut Canvas, (left, top): Point, number: usize, still: &Still) {
     let line = top + 36.0;
     tag(
         canvas,
         (left + INSET + 13.0, line - 9.0),
         &format!("{number}"),
     );
-    let time = format!("{:.1} s", moment.time);
+    let time = format!("{:.1} s", still.time);
     canvas.text((left + INSET + 38.0, line), 27.0, Align::Left, INK, &time);
     let right = left + CELL_WIDTH - INSET;
-    canvas.text((right, line), 27.0, Align::Right, INK, &moment.name);
-    let tilt = format!("base tilted by {:.1}°", moment.stance.tilt().to_degrees());
+    canvas.text((right, line), 27.0, Align::Right, INK, &still.name);
+    let tilt = format!("base tilted by {:.1}°", still.stance.tilt().to_degrees());
     canvas.text((left + INSET, line + 28.0), 21.0, Align::Left, FAINT, &tilt);
 }
 
@@ -326,11 +326,11 @@ fn rectangle(canvas: &mut Canvas, [(left, top), (right, bottom)]: [Point; 2], co
 mod tests {
     use tiny_skia::Pixmap;
 
-    use super::super::testing::{moment, stance};
+    use super::super::testing::{stance, still};
     use super::*;
 
-    fn draw(moments: usize, forward: f64, fall: Option<f64>) -> Pixmap {
-        let moments: Vec<Moment> = (0..moments).map(|index| moment(index as f64)).collect();
+    fn draw(stills: usize, forward: f64, fall: Option<f64>) -> Pixmap {
+        let stills: Vec<Still> = (0..stills).map(|index| still(index as f64)).collect();
         let sway = |frame: usize| (frame as f64 / 30.0).sin();
         let stances: Vec<Stance> = (0..400)
             .map(|frame| stance(0.02 * sway(frame), forward))
@@ -338,7 +338,7 @@ mod tests {
         let sheet = StanceSheet {
             title: "title",
             subtitle: "subtitle",
-            moments: &moments,
+            stills: &stills,
             stances: &stances,
             rate: 50.0,
             fall,
@@ -384,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn two_rows_of_moments_are_higher_than_one() {
+    fn two_rows_of_stills_are_higher_than_one() {
         let [one, two] = [4, 5].map(|count| draw(count, 0.0, None));
         assert!(one.width() == two.width() && two.height() > one.height() + 300);
     }

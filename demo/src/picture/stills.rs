@@ -1,4 +1,4 @@
-//! Which moments of a motion are worth a picture.
+//! Which frames of a motion are worth a picture.
 
 use emp_motion::{KeyNode, KeyNodeFrame};
 
@@ -72,36 +72,36 @@ mod tests {
     use super::*;
 
     #[test]
-    fn moments_are_in_order_apart_and_cover_the_farthest_pose() {
+    fn stills_are_in_order_apart_and_cover_the_farthest_pose() {
         let clip = skills::medley(3);
-        let moments = differing(&clip.frames, &[], 8);
-        assert_eq!(moments.len(), 8);
+        let stills = differing(&clip.frames, &[], 8);
+        assert_eq!(stills.len(), 8);
         let gap = clip.frames.len() / 24;
         assert!(
-            moments.windows(2).all(|pair| pair[1] >= pair[0] + gap),
-            "{moments:?}"
+            stills.windows(2).all(|pair| pair[1] >= pair[0] + gap),
+            "{stills:?}"
         );
         let reach = |index: &usize| distance(&clip.frames[*index], &clip.frames[0]);
         let farthest = (0..clip.frames.len())
             .map(|index| reach(&index))
             .fold(0.0, f32::max);
-        let shown = moments.iter().map(reach).fold(0.0, f32::max);
+        let shown = stills.iter().map(reach).fold(0.0, f32::max);
         assert!(shown > 0.9 * farthest, "{shown} of {farthest}");
     }
 
     #[test]
-    fn a_short_motion_has_as_many_moments_as_frames() {
+    fn a_short_motion_has_as_many_stills_as_frames() {
         let frames = &skills::generate(Skill::Wave, 1).frames[..3];
         assert_eq!(differing(frames, &[], 8), [0, 1, 2]);
         assert!(differing(&[], &[], 8).is_empty());
     }
 
     #[test]
-    fn fixed_moments_are_among_them() {
+    fn fixed_stills_are_among_them() {
         let clip = skills::medley(3);
         let last = clip.frames.len() - 1;
-        let moments = differing(&clip.frames, &[last, last - 1, last], 8);
-        assert_eq!(moments.len(), 8);
-        assert!(moments.ends_with(&[last - 1, last]), "{moments:?}");
+        let stills = differing(&clip.frames, &[last, last - 1, last], 8);
+        assert_eq!(stills.len(), 8);
+        assert!(stills.ends_with(&[last - 1, last]), "{stills:?}");
     }
 }

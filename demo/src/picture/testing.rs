@@ -3,11 +3,11 @@
 use emp_motion::skills;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
-use super::Moment;
+use super::Still;
 use crate::stance::{Footprint, Stance};
 
-/// A moment of the medley, with a robot that does exactly what the person does.
-pub(super) fn moment(time: f64) -> Moment {
+/// A still of the medley, with a robot that does exactly what the person does.
+pub(super) fn still(time: f64) -> Still {
     let frame = skills::medley(1).frames[(time * 50.0) as usize].clone();
     let leg = |y: f32| {
         [
@@ -20,7 +20,7 @@ pub(super) fn moment(time: f64) -> Moment {
         .map(|(x, z)| Vector3::new(x, y, z))
         .to_vec()
     };
-    Moment {
+    Still {
         time,
         name: "reach-overhead".to_owned(),
         direction_error_deg: 1.0,

@@ -164,22 +164,19 @@ impl Emp {
                 *angle += goal;
             }
         }
-        let executable = executable.chunks_exact(layout.goal().len());
+        let joints = layout.goal().len();
+        for goal in executable.chunks_exact_mut(joints) {
+            self.robot.clamp_goal(goal);
+        }
+        let executable = executable.chunks_exact(joints);
         let latents = latents.chunks_exact(self.config.latent);
         let answers = executable.zip(latents);
         Ok(answers
             .map(|(goal, latent)| EmpAnswer {
-                goal: self.inside_ranges(goal.to_vec()),
+                goal: goal.to_vec(),
                 regloss: latent.iter().map(|z| z * z).sum::<f32>() / latent.len() as f32,
             })
             .collect())
-    }
-
-    fn inside_ranges(&self, mut goal: Vec<f32>) -> Vec<f32> {
-        for (angle, joint) in goal.iter_mut().zip(self.robot.goal_joints()) {
-            *angle = angle.clamp(joint.range[0] as f32, joint.range[1] as f32);
-        }
-        goal
     }
 }
 

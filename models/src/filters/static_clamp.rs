@@ -42,7 +42,7 @@ impl StaticClamp {
             polygon: robot.support_polygon(),
             margin: 0.0,
             measured: legs == Some("measured"),
-            default: robot.joints().map(|joint| joint.default as f32).collect(),
+            default: robot.default_pose(),
             robot: Arc::clone(robot),
         };
         let most = clamp.margin(&clamp.default, &UnitQuaternion::identity());

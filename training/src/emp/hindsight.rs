@@ -142,7 +142,7 @@ impl<'a> Hindsight<'a> {
             .chain(&settings.against_contacts);
         Self {
             settings,
-            default_pose: joints.iter().map(|joint| joint.default as f32).collect(),
+            default_pose: robot.default_goal(),
             remedies: remedies.map(remedy).collect(),
         }
     }

@@ -56,8 +56,6 @@ pub struct Moment {
 /// Environments in which an EMP's goals are executed.
 pub struct Collector {
     environments: TrackingEnvironments,
-    /// Of each goal joint, rad.
-    ranges: Vec<[f32; 2]>,
     past: Past,
 }
 
@@ -99,10 +97,7 @@ impl Past {
 impl Collector {
     /// A collector of rollouts in `environments`.
     pub fn new(environments: TrackingEnvironments) -> Self {
-        let joints = environments.robot().goal_joints().iter();
-        let ranges = joints.map(|joint| joint.range.map(|limit| limit as f32));
         Self {
-            ranges: ranges.collect(),
             past: Past::new(environments.goals().len()),
             environments,
         }
@@ -163,10 +158,11 @@ impl Collector {
     /// # Errors
     /// When the simulation fails.
     pub fn execute(&mut self, goals: &[f32]) -> Result<TrackingStep<'_>> {
-        let angles = goals.iter().zip(self.ranges.iter().cycle());
-        let executed: Vec<f32> = angles
-            .map(|(angle, [lower, upper])| angle.clamp(*lower, *upper))
-            .collect();
+        let robot = self.environments.robot();
+        let mut executed = goals.to_vec();
+        for goal in executed.chunks_exact_mut(robot.goal_joints().len()) {
+            robot.clamp_goal(goal);
+        }
         Ok(self.environments.step(&executed)?)
     }
 

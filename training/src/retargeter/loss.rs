@@ -149,12 +149,11 @@ impl Loss {
     /// When a tensor cannot be made.
     pub fn new(robot: &std::sync::Arc<Robot>) -> candle_core::Result<Self> {
         let layout = robot.kinematics().layout();
-        let defaults = robot.goal_joints().iter().map(|joint| joint.default as f32);
         Ok(Self {
             kinematics: ForwardKinematics::new(robot.clone()),
             positions: layout.key_nodes.start,
             wrists: layout.wrist_rotations.start,
-            defaults: Tensor::from_iter(defaults, &Device::Cpu)?.unsqueeze(0)?,
+            defaults: Tensor::new(robot.default_goal(), &Device::Cpu)?.unsqueeze(0)?,
         })
     }
 

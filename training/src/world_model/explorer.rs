@@ -21,8 +21,6 @@ pub struct Explorer {
     wanderers: Vec<Wanderer>,
     /// Largest standard deviation, rad.
     noise: f64,
-    /// Of each goal joint, rad.
-    ranges: Vec<[f32; 2]>,
 }
 
 /// The noise of one environment.
@@ -66,11 +64,9 @@ impl Explorer {
     pub fn new(environments: TrackingEnvironments, noise: f64, seed: u64) -> Self {
         let joints = environments.layout().goal().len();
         let wanderers = 0..environments.len() as u64;
-        let ranges = environments.robot().goal_joints().iter();
         Self {
             wanderers: wanderers.map(|n| Wanderer::new(seed, n, joints)).collect(),
             noise,
-            ranges: ranges.map(|j| j.range.map(|limit| limit as f32)).collect(),
             environments,
         }
     }
@@ -91,18 +87,18 @@ impl Explorer {
     /// The goals that are asked for, and the noise, inside the joints' ranges.
     fn executed(&mut self) -> Vec<f32> {
         let mut goals = self.environments.goals().to_vec();
-        let rows = goals.chunks_exact_mut(self.ranges.len());
+        let robot = self.environments.robot();
+        let rows = goals.chunks_exact_mut(robot.goal_joints().len());
         let starts = self.environments.starts();
         for ((goal, wanderer), &start) in rows.zip(&mut self.wanderers).zip(starts) {
             if start {
                 wanderer.restart(self.noise);
             }
             wanderer.step();
-            for ((goal, offset), [low, high]) in
-                goal.iter_mut().zip(&wanderer.offset).zip(&self.ranges)
-            {
-                *goal = (*goal + offset).clamp(*low, *high);
+            for (angle, offset) in goal.iter_mut().zip(&wanderer.offset) {
+                *angle += offset;
             }
+            robot.clamp_goal(goal);
         }
         goals
     }
@@ -121,7 +117,7 @@ impl Explorer {
     /// Goes on from a snapshot of an explorer with the same settings, bit for bit.
     ///
     /// # Errors
-    /// If it is none.
+    /// If it is not a snapshot of such an explorer.
     pub fn restore(&mut self, snapshot: &[u8]) -> Result<()> {
         let (environments, wanderers): (Vec<u8>, _) = postcard::from_bytes(snapshot)?;
         self.environments.restore(&environments)?;

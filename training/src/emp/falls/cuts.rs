@@ -54,7 +54,7 @@ impl Cut {
         }
         let every =
             || -> Option<Arc<dyn GoalFilter>> { Some(Arc::new(JointCut::new(robot, |_| true))) };
-        let default = joints.iter().map(|joint| joint.default as f32).collect();
+        let default = robot.default_goal();
         cuts.extend([
             Self {
                 name: "all goal joints".to_owned(),
@@ -164,11 +164,7 @@ mod tests {
     #[test]
     fn each_cut_leaves_the_rest_alone() {
         let robot = robot();
-        let default: Vec<f32> = robot
-            .goal_joints()
-            .iter()
-            .map(|joint| joint.default as f32)
-            .collect();
+        let default: Vec<f32> = robot.default_goal();
         let asked: Vec<f32> = default.iter().map(|angle| angle + 0.5).collect();
         let small: Vec<f32> = default.iter().map(|angle| angle + 0.4).collect();
         let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6);

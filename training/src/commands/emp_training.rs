@@ -11,7 +11,7 @@ use emp_training::{
         data::{self, Motions},
         imagination::FrozenWorldModel,
         judge::Judge,
-        settings::{Preset, Settings},
+        settings::{EmpSettings, Preset},
         trainer::{self, Run, Trainer},
     },
     equipment::Equipment,
@@ -74,7 +74,7 @@ pub(super) struct Setup {
 }
 
 impl Setup {
-    pub(super) fn new(arguments: &TrainingArguments, settings: &Settings) -> Result<Self> {
+    pub(super) fn new(arguments: &TrainingArguments, settings: &EmpSettings) -> Result<Self> {
         let robot = arguments.robot.load()?;
         let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
         let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
@@ -117,7 +117,7 @@ impl Setup {
     pub(super) fn train(
         &self,
         arguments: &TrainingArguments,
-        settings: Settings,
+        settings: EmpSettings,
         files: &RunFiles,
         interrupt: &Interrupt,
     ) -> Result<Option<ExitCode>> {
@@ -159,8 +159,8 @@ pub(super) fn files(arguments: &TrainingArguments, folder: PathBuf) -> RunFiles 
 }
 
 /// The preset's settings with the arguments' changes.
-pub(super) fn settings(arguments: &TrainingArguments) -> Result<Settings> {
-    let mut settings = Settings::preset(arguments.preset);
+pub(super) fn settings(arguments: &TrainingArguments) -> Result<EmpSettings> {
+    let mut settings = EmpSettings::preset(arguments.preset);
     settings.seed = arguments.seed;
     for change in &arguments.changes {
         let (key, value) = change

@@ -8,7 +8,7 @@ use emp_models::linear;
 use emp_training::{
     retargeter::{
         data::{self, Dataset},
-        trainer::{self, Settings, Trainer},
+        trainer::{self, RetargeterSettings, Trainer},
     },
     run::{Interrupt, Outcome, RunFiles},
 };
@@ -72,7 +72,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         weights: arguments.out.clone(),
         save_every,
     };
-    let settings = Settings {
+    let settings = RetargeterSettings {
         steps: arguments.steps,
         batch: arguments.batch,
         learning_rate: arguments.learning_rate,

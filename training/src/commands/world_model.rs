@@ -17,7 +17,7 @@ use emp_training::{
     equipment::Equipment,
     run::{Interrupt, Outcome, RunFiles},
     world_model::{
-        settings::Settings,
+        settings::WorldModelSettings,
         trainer::{self, Trainer},
     },
 };
@@ -45,22 +45,22 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Steps of the optimiser.
-    #[arg(long, default_value_t = Settings::default().steps)]
+    #[arg(long, default_value_t = WorldModelSettings::default().steps)]
     steps: u64,
     /// Control periods that the loss predicts one after the other; 1 is the paper's.
-    #[arg(long, default_value_t = Settings::default().wm_loss_steps)]
+    #[arg(long, default_value_t = WorldModelSettings::default().wm_loss_steps)]
     loss_steps: usize,
     /// Sequences in a batch.
-    #[arg(long, default_value_t = Settings::default().rows)]
+    #[arg(long, default_value_t = WorldModelSettings::default().rows)]
     rows: usize,
     /// Environments stepped side by side.
-    #[arg(long, default_value_t = Settings::default().environments)]
+    #[arg(long, default_value_t = WorldModelSettings::default().environments)]
     environments: usize,
     /// Procedural motions in the mix.
-    #[arg(long, default_value_t = Settings::default().procedural_clips)]
+    #[arg(long, default_value_t = WorldModelSettings::default().procedural_clips)]
     procedural_clips: usize,
     /// Seed of weights, episodes and procedural skills.
-    #[arg(long, default_value_t = Settings::default().seed)]
+    #[arg(long, default_value_t = WorldModelSettings::default().seed)]
     seed: u64,
     /// Continue the run from its checkpoint.
     #[arg(long)]
@@ -105,22 +105,22 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     }
 }
 
-fn settings(arguments: &Arguments) -> Settings {
-    Settings {
+fn settings(arguments: &Arguments) -> WorldModelSettings {
+    WorldModelSettings {
         seed: arguments.seed,
         steps: arguments.steps,
         environments: arguments.environments,
         rows: arguments.rows,
         wm_loss_steps: arguments.loss_steps,
         procedural_clips: arguments.procedural_clips,
-        ..Settings::default()
+        ..WorldModelSettings::default()
     }
 }
 
 fn equipment(
     arguments: &Arguments,
     robot: Arc<Robot>,
-    settings: &Settings,
+    settings: &WorldModelSettings,
 ) -> Result<(Equipment, serde_json::Value)> {
     let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
     let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;

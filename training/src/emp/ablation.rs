@@ -13,7 +13,7 @@ use emp_robot::Robot;
 use emp_sim::{evaluation::Evaluation, suite::Condition};
 use serde::Serialize;
 
-use super::{judge::Judge, settings::Settings};
+use super::{judge::Judge, settings::EmpSettings};
 
 /// What is left out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -49,7 +49,7 @@ impl Row {
     }
 
     /// The settings of the row's training, which has `full` but for a part.
-    pub fn settings(self, full: &Settings) -> Settings {
+    pub fn settings(self, full: &EmpSettings) -> EmpSettings {
         let mut settings = full.clone();
         let weights = &mut settings.losses.weights;
         match self {
@@ -168,7 +168,7 @@ mod tests {
 
     #[test]
     fn a_row_leaves_out_one_part() {
-        let full = Settings::preset(Preset::Paper);
+        let full = EmpSettings::preset(Preset::Paper);
         assert_eq!(Row::Full.settings(&full), full);
         for row in &Row::ALL[1..] {
             let settings = row.settings(&full);

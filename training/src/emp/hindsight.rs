@@ -1,6 +1,6 @@
-//! The lesson of falls and contacts: what should have been executed, found by running moments of a rollout again with other goals.
+//! The lesson of falls and contacts: what should have been executed, found by running fork points of a rollout again with other goals.
 //!
-//! A rollout shows where the EMP's own goals led, not where others would have led. So some of its moments are run again from
+//! A rollout shows where the EMP's own goals led, not where others would have led. So some of its fork points are run again from
 //! the very same state, under the same load and pushes. Where the robot fell, or pressed its links on one another: with the goals as
 //! they were asked for, and with tamer ones. Where it went well, but the EMP had changed the goals: with the goals as they were asked
 //! for, and with half the change. Of what goes well (before a fall: of what stands) the smallest change is what the EMP should have
@@ -14,11 +14,11 @@ use rand::{SeedableRng as _, seq::SliceRandom as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    rollout::{Collector, Rollout},
+    rollout::{EmpCollector, EmpRollout},
     settings::{HindsightSettings, Remedy},
 };
 
-/// What the generator that chooses among moments has in its seed beside the run's.
+/// What the generator that chooses among fork points has in its seed beside the run's.
 const CHOICE: u64 = 0x656d_705f_6873;
 
 /// What is known of the goal of a row of a rollout.
@@ -45,18 +45,18 @@ pub struct Labels {
     pub counts: Counts,
 }
 
-/// What came of the moments that were run again.
+/// What came of the fork points that were run again.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Moments before a fall.
+    /// Fork points before a fall.
     pub falls: usize,
     /// Those of them in which some goals go well.
     pub avoidable: usize,
-    /// Moments of contact without a fall.
+    /// Fork points of contact without a fall.
     pub contacts: usize,
     /// Those of them in which some goals go well.
     pub relievable: usize,
-    /// Moments that went well with changed goals.
+    /// Fork points that went well with changed goals.
     pub changes: usize,
     /// Those of them that do not without the change.
     pub needed: usize,
@@ -73,13 +73,13 @@ enum Candidate {
     Tamed(usize),
 }
 
-/// A moment whose future is known.
+/// A fork point whose future is known.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Window {
     environment: usize,
-    /// Index of its moment.
-    moment: usize,
-    /// Control periods that it speaks of: those to the next moment, or to the episode's end.
+    /// Index of its fork point.
+    fork_point: usize,
+    /// Control periods that it speaks of: those to the next fork point, or to the episode's end.
     periods: usize,
     fell: bool,
     /// Whether the robot's links pressed on one another too much.
@@ -106,7 +106,7 @@ struct Replay {
     end: End,
 }
 
-/// Runs moments again.
+/// Runs fork points again.
 pub struct Hindsight<'a> {
     settings: &'a HindsightSettings,
     /// Angles of the goal joints in the default pose, rad.
@@ -147,15 +147,15 @@ impl<'a> Hindsight<'a> {
         }
     }
 
-    /// What hindsight says of `rollout`, which `collector` collected with `network`; `seed` chooses among more moments than may
+    /// What hindsight says of `rollout`, which `collector` collected with `network`; `seed` chooses among more fork points than may
     /// be run again.
     ///
     /// # Errors
     /// When the network or the simulation fails.
     pub fn labels(
         &self,
-        rollout: &Rollout,
-        collector: &Collector,
+        rollout: &EmpRollout,
+        collector: &EmpCollector,
         network: &EmpNetwork,
         seed: u64,
         threads: &rayon::ThreadPool,
@@ -193,18 +193,18 @@ impl<'a> Hindsight<'a> {
         }
     }
 
-    /// The moments whose future is known as far as the horizon, or to the episode's end.
-    fn windows(&self, rollout: &Rollout) -> Vec<Window> {
+    /// The fork points whose future is known as far as the horizon, or to the episode's end.
+    fn windows(&self, rollout: &EmpRollout) -> Vec<Window> {
         let mut windows = Vec::new();
-        for (index, moment) in rollout.moments.iter().enumerate() {
+        for (index, fork_point) in rollout.fork_points.iter().enumerate() {
             for environment in 0..rollout.environments {
-                let lived = rollout.lived(moment.period, environment, self.settings.horizon);
+                let lived = rollout.lived(fork_point.period, environment, self.settings.horizon);
                 let Some((lived, end)) = lived.filter(|(_, end)| *end != End::Diverged) else {
                     continue;
                 };
                 let mut window = Window {
                     environment,
-                    moment: index,
+                    fork_point: index,
                     periods: lived.min(self.settings.window),
                     fell: end == End::Terminated,
                     touched: false,
@@ -219,7 +219,7 @@ impl<'a> Hindsight<'a> {
     }
 
     /// What is tried in the first of `windows`, as many as may be.
-    fn replays(&self, rollout: &Rollout, windows: &[Window]) -> Vec<Replay> {
+    fn replays(&self, rollout: &EmpRollout, windows: &[Window]) -> Vec<Replay> {
         let width = self.default_pose.len();
         let mut replays = Vec::new();
         for (index, window) in windows.iter().enumerate() {
@@ -263,14 +263,14 @@ impl<'a> Hindsight<'a> {
         &self,
         replays: &mut [Replay],
         windows: &[Window],
-        rollout: &Rollout,
-        collector: &Collector,
+        rollout: &EmpRollout,
+        collector: &EmpCollector,
         network: &EmpNetwork,
         threads: &rayon::ThreadPool,
     ) -> Result<()> {
         let origins = replays.iter().map(|replay| {
             let window = &windows[replay.window];
-            (&rollout.moments[window.moment], window.environment)
+            (&rollout.fork_points[window.fork_point], window.environment)
         });
         let mut fork = collector.fork(origins);
         let width = self.default_pose.len();
@@ -323,14 +323,14 @@ impl<'a> Hindsight<'a> {
 
 impl Window {
     /// Its rows in the rollout.
-    fn rows(self, rollout: &Rollout) -> impl Iterator<Item = usize> {
-        let start = rollout.moments[self.moment].period;
+    fn rows(self, rollout: &EmpRollout) -> impl Iterator<Item = usize> {
+        let start = rollout.fork_points[self.fork_point].period;
         let n = rollout.environments;
         (start..start + self.periods).map(move |period| period * n + self.environment)
     }
 
     /// Mean absolute change of a goal angle, rad.
-    fn change(self, rollout: &Rollout) -> f64 {
+    fn change(self, rollout: &EmpRollout) -> f64 {
         let width = rollout.goals.len() / rollout.rows();
         let changes = self.rows(rollout).flat_map(|row| {
             let row = row * width..(row + 1) * width;
@@ -341,7 +341,7 @@ impl Window {
     }
 
     /// Mean force between the robot's own links, N.
-    fn contact(self, rollout: &Rollout) -> f64 {
+    fn contact(self, rollout: &EmpRollout) -> f64 {
         let forces = self
             .rows(rollout)
             .map(|row| f64::from(rollout.contact[row]));
@@ -349,7 +349,7 @@ impl Window {
     }
 
     /// The goal that was executed before it.
-    fn executed_before(self, rollout: &Rollout, width: usize) -> &[f32] {
+    fn executed_before(self, rollout: &EmpRollout, width: usize) -> &[f32] {
         let row = self.rows(rollout).next().unwrap_or_default();
         let [_, before] = &rollout.answers_before;
         &before[row * width..(row + 1) * width]
@@ -367,7 +367,7 @@ impl Window {
         }
     }
 
-    fn label(self, rollout: &Rollout, label: Label, labels: &mut [Label]) {
+    fn label(self, rollout: &EmpRollout, label: Label, labels: &mut [Label]) {
         for row in self.rows(rollout) {
             labels[row] = label;
         }
@@ -420,7 +420,7 @@ impl Replay {
 
 impl Labels {
     /// Learns from what was tried in a window; `contact` (N) is too much.
-    fn judge(&mut self, window: &Window, replays: &[Replay], rollout: &Rollout, contact: f64) {
+    fn judge(&mut self, window: &Window, replays: &[Replay], rollout: &EmpRollout, contact: f64) {
         let good = replays.iter().filter(|replay| match window.fell {
             true => replay.stood(),
             false => replay.goes_well(contact, window.periods),
@@ -468,25 +468,25 @@ mod tests {
 
     use super::*;
     use crate::emp::{
-        rollout::Moment,
-        settings::{Preset, Settings},
+        rollout::ForkPoint,
+        settings::{EmpSettings, Preset},
     };
 
     /// One environment, two control periods, one joint; asked for 1 and 2 rad, answered 1.5 and 2.5.
-    fn rollout() -> Rollout {
-        Rollout {
+    fn rollout() -> EmpRollout {
+        EmpRollout {
             environments: 1,
             goals: vec![1.0, 2.0],
             answers: vec![1.5, 2.5],
             ends: vec![End::None; 2],
-            moments: vec![Moment::default()],
-            ..Rollout::default()
+            fork_points: vec![ForkPoint::default()],
+            ..EmpRollout::default()
         }
     }
 
     const FELL: Window = Window {
         environment: 0,
-        moment: 0,
+        fork_point: 0,
         periods: 2,
         fell: true,
         touched: false,
@@ -600,7 +600,7 @@ mod tests {
     }
 
     #[test]
-    fn moments_are_counted_by_what_is_wrong_with_them() {
+    fn fork_points_are_counted_by_what_is_wrong_with_them() {
         let mut counts = Counts::default();
         counts.add(&FELL, Label::Right, true);
         counts.add(&FELL, Label::Unknown, false);
@@ -629,7 +629,7 @@ mod tests {
         };
         let settings = HindsightSettings {
             against_falls: vec![waist],
-            ..Settings::preset(Preset::Default).hindsight
+            ..EmpSettings::preset(Preset::Default).hindsight
         };
         let hindsight = Hindsight::new(&robot, &settings);
         let default = hindsight.default_pose.clone();
@@ -663,8 +663,8 @@ mod tests {
     }
 
     #[test]
-    fn windows_are_moments_whose_future_is_known() {
-        let settings = Settings::preset(Preset::Default);
+    fn windows_are_fork_points_whose_future_is_known() {
+        let settings = EmpSettings::preset(Preset::Default);
         let settings = HindsightSettings {
             window: 2,
             horizon: 3,
@@ -676,27 +676,34 @@ mod tests {
             default_pose: vec![0.0],
             remedies: Vec::new(),
         };
-        let moment = |period| Moment {
+        let fork_point = |period| ForkPoint {
             period,
             ..Default::default()
         };
         // Six control periods; the episode ends with a fall in the second.
-        let mut rollout = Rollout {
+        let mut rollout = EmpRollout {
             environments: 1,
             goals: vec![1.0; 6],
             answers: vec![1.0, 1.0, 1.3, 1.0, 1.0, 1.0],
             contact: vec![0.0; 6],
             ends: vec![End::None; 6],
-            moments: [0, 2, 4].map(moment).to_vec(),
-            ..Rollout::default()
+            fork_points: [0, 2, 4].map(fork_point).to_vec(),
+            ..EmpRollout::default()
         };
         rollout.ends[1] = End::Terminated;
         let found: Vec<_> = hindsight
             .windows(&rollout)
             .iter()
-            .map(|window| (window.moment, window.periods, window.fell, window.changed))
+            .map(|window| {
+                (
+                    window.fork_point,
+                    window.periods,
+                    window.fell,
+                    window.changed,
+                )
+            })
             .collect();
-        // Of the last moment's three control periods only two are known.
+        // Of the last fork point's three control periods only two are known.
         assert_eq!(found, [(0, 2, true, false), (1, 2, false, true)]);
     }
 }

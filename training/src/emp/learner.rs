@@ -28,8 +28,8 @@ use super::{
     imagination::{Imagination, ImaginedStep},
     memory::Memory,
     objective::{Moments, Objective},
-    rollout::Rollout,
-    settings::Settings,
+    rollout::EmpRollout,
+    settings::EmpSettings,
 };
 use crate::{
     policy::moments::RunningMoments,
@@ -47,7 +47,7 @@ const NORMALIZER: &str = "emp-normalizer";
 
 /// Learns an EMP from rollouts.
 pub struct Learner {
-    settings: Settings,
+    settings: EmpSettings,
     layout: ObservationLayout,
     network: EmpNetwork,
     normalizer: Normalizer,
@@ -92,7 +92,7 @@ impl Learner {
     ///
     /// # Errors
     /// When a tensor cannot be made.
-    pub fn new(robot: &Arc<Robot>, settings: &Settings, warm_up: &WarmUp) -> Result<Self> {
+    pub fn new(robot: &Arc<Robot>, settings: &EmpSettings, warm_up: &WarmUp) -> Result<Self> {
         let config = settings.network.config(robot);
         let layout = config.observation;
         let normalizer = warm_up.normalizer(&config);
@@ -220,7 +220,7 @@ impl Learner {
     /// When a gradient is not a number.
     pub fn update(
         &mut self,
-        rollout: &Rollout,
+        rollout: &EmpRollout,
         labels: Option<&Labels>,
         imagination: Option<&Imagination>,
         threads: &rayon::ThreadPool,
@@ -335,7 +335,7 @@ impl Learner {
     }
 
     /// What the losses look at. The smoothness loss looks back at answers, not at what was executed of them.
-    fn moments(&self, rollout: &Rollout, rows: &[usize]) -> Result<Moments> {
+    fn moments(&self, rollout: &EmpRollout, rows: &[usize]) -> Result<Moments> {
         let layout = &self.layout;
         let joints = layout.goal().len();
         let mut stacks = gather(&rollout.stacks, layout.width(), rows);
@@ -428,7 +428,7 @@ impl WarmUp {
     ///
     /// # Errors
     /// When the robot fell in every environment.
-    pub fn new(rollout: Rollout, layout: &ObservationLayout) -> Result<Self> {
+    pub fn new(rollout: EmpRollout, layout: &ObservationLayout) -> Result<Self> {
         let safe = safe_rows(&rollout);
         anyhow::ensure!(
             !safe.is_empty(),
@@ -460,7 +460,7 @@ impl WarmUp {
 
 /// What is learnt from.
 struct Source<'a> {
-    rollout: &'a Rollout,
+    rollout: &'a EmpRollout,
     /// What hindsight says of the rows.
     labels: Option<&'a Labels>,
     imagination: Option<&'a Imagination>,
@@ -547,7 +547,7 @@ fn labelled(labels: &Labels, rows: &[usize], label: Label) -> candle_core::Resul
 }
 
 /// Rows that are followed by `horizon` − 1 more of the same episode within the rollout.
-pub(super) fn usable_rows(rollout: &Rollout, horizon: usize) -> Vec<usize> {
+pub(super) fn usable_rows(rollout: &EmpRollout, horizon: usize) -> Vec<usize> {
     let ahead = horizon.saturating_sub(1);
     let follows = |row: usize| {
         let next = row + ahead * rollout.environments;
@@ -558,7 +558,7 @@ pub(super) fn usable_rows(rollout: &Rollout, horizon: usize) -> Vec<usize> {
 }
 
 /// Rows of environments in which nobody fell.
-fn safe_rows(rollout: &Rollout) -> Vec<usize> {
+fn safe_rows(rollout: &EmpRollout) -> Vec<usize> {
     let n = rollout.environments;
     let stood = |environment: usize| {
         let mut ends = rollout.ends[environment..].iter().step_by(n);

@@ -9,7 +9,7 @@ use rand::{Rng, RngExt as _};
 
 use super::{
     hindsight::{Label, Labels},
-    rollout::Rollout,
+    rollout::EmpRollout,
 };
 use crate::rows::{gather, gathered};
 
@@ -88,7 +88,7 @@ impl Memory {
     /// Remembers what hindsight says of a rollout.
     pub fn add(
         &mut self,
-        rollout: &Rollout,
+        rollout: &EmpRollout,
         labels: &Labels,
         network: &EmpNetwork,
         layout: &ObservationLayout,

@@ -18,7 +18,7 @@ const PAST: usize = 2;
 
 /// Trajectories of N environments over T control periods; row t·N + n is period t of environment n.
 #[derive(Debug, Default)]
-pub struct Rollout {
+pub struct EmpRollout {
     /// N.
     pub environments: usize,
     /// Stacks `S_t` with the goal that was asked for in the newest frame.
@@ -41,20 +41,20 @@ pub struct Rollout {
     pub contact: Vec<f32>,
     /// How the periods ended.
     pub ends: Vec<End>,
-    /// Moments from which other goals can be tried.
-    pub moments: Vec<Moment>,
+    /// Fork points from which other goals can be tried.
+    pub fork_points: Vec<ForkPoint>,
 }
 
 /// The environments at the start of a control period.
 #[derive(Clone, Debug, Default)]
-pub struct Moment {
+pub struct ForkPoint {
     /// Number of the control period.
     pub period: usize,
     pub(super) states: Vec<TrackingState>,
 }
 
 /// Environments in which an EMP's goals are executed.
-pub struct Collector {
+pub struct EmpCollector {
     environments: TrackingEnvironments,
     past: Past,
 }
@@ -94,7 +94,7 @@ impl Past {
     }
 }
 
-impl Collector {
+impl EmpCollector {
     /// A collector of rollouts in `environments`.
     pub fn new(environments: TrackingEnvironments) -> Self {
         Self {
@@ -109,7 +109,7 @@ impl Collector {
     }
 
     /// Runs the environments for `frames` control periods with `network`'s answers, without one with the goals that are asked
-    /// for. Forward passes run on `threads`. Every `moments` control periods, if not 0, there is a moment from which other goals
+    /// for. Forward passes run on `threads`. Every `fork_interval` control periods, if not 0, there is a fork point from which other goals
     /// can be tried.
     ///
     /// # Errors
@@ -118,16 +118,16 @@ impl Collector {
         &mut self,
         network: Option<&EmpNetwork>,
         frames: usize,
-        moments: usize,
+        fork_interval: usize,
         threads: &rayon::ThreadPool,
-    ) -> Result<Rollout> {
-        let mut rollout = Rollout {
+    ) -> Result<EmpRollout> {
+        let mut rollout = EmpRollout {
             environments: self.environments.len(),
-            ..Rollout::default()
+            ..EmpRollout::default()
         };
         for period in 0..frames {
-            if moments > 0 && period % moments == 0 {
-                rollout.moments.push(Moment {
+            if fork_interval > 0 && period % fork_interval == 0 {
+                rollout.fork_points.push(ForkPoint {
                     period,
                     states: self.environments.states(),
                 });
@@ -147,9 +147,9 @@ impl Collector {
         Ok(rollout)
     }
 
-    /// Robots that go on from moments of a rollout of this collector, one a row: each from its moment and environment.
-    pub fn fork<'a>(&self, origins: impl Iterator<Item = (&'a Moment, usize)>) -> Self {
-        let states = origins.map(|(moment, environment)| &moment.states[environment]);
+    /// Robots that go on from fork points of a rollout of this collector, one a row: each from its fork point and environment.
+    pub fn fork<'a>(&self, origins: impl Iterator<Item = (&'a ForkPoint, usize)>) -> Self {
+        let states = origins.map(|(fork_point, environment)| &fork_point.states[environment]);
         Self::new(self.environments.fork(states))
     }
 
@@ -211,7 +211,7 @@ impl Collector {
     }
 }
 
-impl Rollout {
+impl EmpRollout {
     /// Number of rows.
     pub fn rows(&self) -> usize {
         self.ends.len()
@@ -267,10 +267,10 @@ mod tests {
     #[test]
     fn what_follows_a_period_is_known_within_its_episode_and_the_rollout() {
         // Two environments, four periods: the first falls in the third, the second's episode times out in the second.
-        let mut rollout = Rollout {
+        let mut rollout = EmpRollout {
             environments: 2,
             ends: vec![End::None; 8],
-            ..Rollout::default()
+            ..EmpRollout::default()
         };
         rollout.ends[4] = End::Terminated;
         rollout.ends[3] = End::TimedOut;

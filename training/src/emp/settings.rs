@@ -24,7 +24,7 @@ pub enum Preset {
 /// Everything that shapes a run but the robot and its data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Settings {
+pub struct EmpSettings {
     /// Seed of weights, episodes and mini-batches.
     pub seed: u64,
     /// Environments stepped side by side.
@@ -112,11 +112,11 @@ pub struct HindsightSettings {
     pub weight: f64,
     /// The same against a contact. 0: nothing is learnt from contacts.
     pub contact_weight: f64,
-    /// Control periods from one moment that is run again to the next.
+    /// Control periods from one fork point to the next.
     pub window: usize,
-    /// Control periods within which a fall is a moment's.
+    /// Control periods within which a fall belongs to a fork point.
     pub horizon: usize,
-    /// Moments run again after a rollout, at most, times the goals that are tried in each.
+    /// Fork points run again after a rollout, at most, times the goals that are tried in each.
     pub replays: usize,
     /// Mean change of a goal angle in a window that has to prove that it is needed, rad.
     pub change: f64,
@@ -196,7 +196,7 @@ pub struct OptimizerSettings {
     pub averaging: f64,
 }
 
-impl Settings {
+impl EmpSettings {
     /// The settings of a preset.
     pub fn preset(preset: Preset) -> Self {
         match preset {
@@ -308,8 +308,8 @@ impl Settings {
         }
     }
 
-    /// Control periods between two moments of a rollout that can be run again; 0: none can.
-    pub fn moments(&self) -> usize {
+    /// Control periods between two fork points of a rollout; 0: there are none.
+    pub fn fork_interval(&self) -> usize {
         if self.hindsight.weight > 0.0 {
             self.hindsight.window
         } else {
@@ -417,7 +417,7 @@ mod tests {
 
     #[test]
     fn settings_are_changed_by_their_path_and_mistakes_are_named() {
-        let mut settings = Settings::preset(Preset::Paper);
+        let mut settings = EmpSettings::preset(Preset::Paper);
         settings.set("hindsight.weight", "20").unwrap();
         settings.set("losses.smooth_on", "correction").unwrap();
         settings.set("network.gate", r#"{"tilt": 0.3}"#).unwrap();
@@ -445,9 +445,9 @@ mod tests {
     fn the_presets_can_be_trained_and_the_papers_is_the_papers() {
         let robot = Robot::load("../robots/emp27".as_ref()).unwrap();
         for preset in [Preset::Paper, Preset::Default] {
-            Settings::preset(preset).check().unwrap();
+            EmpSettings::preset(preset).check().unwrap();
         }
-        let paper = Settings::preset(Preset::Paper);
+        let paper = EmpSettings::preset(Preset::Paper);
         assert_eq!(paper.network.config(&robot), EmpConfig::paper(&robot));
         assert_eq!(paper.losses, LossSettings::default());
         assert_eq!((paper.horizon, paper.hindsight.weight), (1, 0.0));

@@ -22,8 +22,8 @@ use super::{
     judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics, WarmUp},
     objective::Terms,
-    rollout::Collector,
-    settings::Settings,
+    rollout::EmpCollector,
+    settings::EmpSettings,
 };
 use crate::{
     equipment::Equipment,
@@ -59,10 +59,10 @@ const COLUMNS: [&str; 15] = [
 /// A run: the learner, its environments, and how far they are.
 pub struct Trainer {
     equipment: Equipment,
-    settings: Settings,
+    settings: EmpSettings,
     /// Settings that the run had before, with the steps at which they were left.
     past: Vec<Phase>,
-    collector: Collector,
+    collector: EmpCollector,
     learner: Learner,
     /// Policy and world model, where anything is imagined.
     imagination: Option<Imagination>,
@@ -76,7 +76,7 @@ pub struct Trainer {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Phase {
     until_step: u64,
-    settings: Settings,
+    settings: EmpSettings,
     #[serde(default)]
     world_model: Option<String>,
 }
@@ -84,7 +84,7 @@ struct Phase {
 /// What a run's checkpoint says of its progress.
 #[derive(Serialize, Deserialize)]
 struct Saved {
-    settings: Settings,
+    settings: EmpSettings,
     #[serde(default)]
     past: Vec<Phase>,
     steps: u64,
@@ -111,7 +111,7 @@ impl Trainer {
     pub fn new(
         equipment: Equipment,
         world_model: Option<&FrozenWorldModel>,
-        settings: Settings,
+        settings: EmpSettings,
     ) -> Result<Self> {
         settings.check()?;
         let world_model = match settings.horizon {
@@ -127,7 +127,7 @@ impl Trainer {
         };
         let (episodes, count) = (settings.episodes, settings.environments);
         let environments = equipment.environments(episodes, count, settings.seed)?;
-        let mut collector = Collector::new(environments);
+        let mut collector = EmpCollector::new(environments);
         let rollout = collector.collect(None, settings.warm_up, 0, &equipment.threads)?;
         let layout = *collector.environments().layout();
         let warm_up = WarmUp::new(rollout, &layout)?;
@@ -151,7 +151,7 @@ impl Trainer {
     pub fn resume(
         equipment: Equipment,
         world_model: Option<&FrozenWorldModel>,
-        settings: Settings,
+        settings: EmpSettings,
         path: &Path,
         may_change: bool,
     ) -> Result<Self> {
@@ -279,10 +279,10 @@ impl Trainer {
         let threads = &self.equipment.threads;
         let network = self.learner.network().clone();
         let frames = self.settings.frames;
-        let moments = self.settings.moments();
+        let fork_interval = self.settings.fork_interval();
         let rollout = self
             .collector
-            .collect(Some(&network), frames, moments, threads)?;
+            .collect(Some(&network), frames, fork_interval, threads)?;
         let collecting = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let mut labels = None;

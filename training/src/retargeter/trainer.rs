@@ -35,7 +35,7 @@ const CODE_WINDOW: u64 = 100;
 /// Settings of a run. Two runs with the same settings, data and binary make the same bits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Settings {
+pub struct RetargeterSettings {
     /// Optimiser steps.
     pub steps: u64,
     /// Frames a step.
@@ -51,7 +51,7 @@ pub struct Settings {
 /// A run: network, optimiser, and how far they are.
 pub struct Trainer {
     robot: Arc<Robot>,
-    settings: Settings,
+    settings: RetargeterSettings,
     network: RetargetNetwork,
     vars: VarMap,
     adam: Adam,
@@ -73,7 +73,7 @@ impl Trainer {
     ///
     /// # Errors
     /// When a tensor cannot be made.
-    pub fn new(robot: Arc<Robot>, settings: Settings) -> Result<Self> {
+    pub fn new(robot: Arc<Robot>, settings: RetargeterSettings) -> Result<Self> {
         let vars = VarMap::new();
         let config = NetworkConfig::default();
         let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
@@ -99,7 +99,7 @@ impl Trainer {
     ///
     /// # Errors
     /// When the checkpoint is damaged, or its run had other settings or another robot.
-    pub fn resume(robot: Arc<Robot>, settings: Settings, path: &Path) -> Result<Self> {
+    pub fn resume(robot: Arc<Robot>, settings: RetargeterSettings, path: &Path) -> Result<Self> {
         let (metadata, tensors) = checkpoint::load(path)?;
         metadata.check(path, &CheckpointMetadata::for_goal_joints(RUN_KIND, &robot))?;
         let saved: Progress = serde_json::from_value(metadata.training)
@@ -260,7 +260,7 @@ impl Trainer {
 /// What a run's checkpoint says of its progress.
 #[derive(Serialize, Deserialize)]
 struct Progress {
-    settings: Settings,
+    settings: RetargeterSettings,
     step: u64,
 }
 

@@ -30,7 +30,7 @@ const ROWS: usize = 64;
 /// Ways to tell what comes.
 const GUESSES: [&str; 3] = ["world model", "constant velocity", "hold position"];
 
-/// Errors of predictions from held-out moments. As JSON one object; [`Display`](fmt::Display) writes a table in Markdown.
+/// Errors of predictions from held-out states. As JSON one object; [`Display`](fmt::Display) writes a table in Markdown.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Accuracy {
     /// Name of the robot.
@@ -71,7 +71,7 @@ struct Sums {
 /// Errors of each guess at each distance, over all sequences and over those near falls.
 type Table = [[[Sums; 2]; AHEAD.len()]; GUESSES.len()];
 
-/// Plays `frames` control periods with the goals that are asked for, and predicts from every fourth moment, with the actions and
+/// Plays `frames` control periods with the goals that are asked for, and predicts from every fourth state, with the actions and
 /// goals that followed.
 ///
 /// # Errors
@@ -116,7 +116,7 @@ pub fn measure(
     })
 }
 
-/// Predicts sequences; `is_near` says of a row and a distance whether that moment is near a fall.
+/// Predicts sequences; `is_near` says of a row and a distance whether that state is near a fall.
 fn predict(
     model: &WorldModel,
     sequences: &Sequences,

@@ -1,8 +1,8 @@
-//! What a world model learns from: moments of robots, and the control periods that followed.
+//! What a world model learns from: states of robots, and the control periods that followed.
 
 use emp_models::observation::ObservationLayout;
 
-/// N moments and the control periods that followed them.
+/// N states and the control periods that followed them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sequences {
     /// Stacks `S_t` with the executed goal in the newest frame, N × [`ObservationLayout::width`].
@@ -23,7 +23,7 @@ pub struct Period {
 }
 
 impl Sequences {
-    /// Number of moments.
+    /// Number of sequences.
     pub fn len(&self, layout: &ObservationLayout) -> usize {
         self.stacks.len() / layout.width()
     }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 /// Everything that shapes a run but the robot and its data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Settings {
+pub struct WorldModelSettings {
     /// Seed of weights, episodes and batches.
     pub seed: u64,
     /// Steps of the optimiser.
@@ -70,7 +70,7 @@ impl Default for LearnerSettings {
     }
 }
 
-impl Default for Settings {
+impl Default for WorldModelSettings {
     fn default() -> Self {
         Self {
             seed: 1,
@@ -95,7 +95,7 @@ impl Default for Settings {
     }
 }
 
-impl Settings {
+impl WorldModelSettings {
     /// Refuses settings with which nothing can be learnt.
     ///
     /// # Errors
@@ -165,30 +165,30 @@ mod tests {
 
     #[test]
     fn mistakes_are_named() {
-        Settings::default().check().unwrap();
-        let error = |settings: Settings| settings.check().unwrap_err().to_string();
-        let settings = Settings {
+        WorldModelSettings::default().check().unwrap();
+        let error = |settings: WorldModelSettings| settings.check().unwrap_err().to_string();
+        let settings = WorldModelSettings {
             wm_loss_steps: 0,
-            ..Settings::default()
+            ..WorldModelSettings::default()
         };
         assert!(error(settings).contains("`wm_loss_steps` is 0"));
-        let settings = Settings {
+        let settings = WorldModelSettings {
             frames: 5,
-            ..Settings::default()
+            ..WorldModelSettings::default()
         };
         assert!(error(settings).contains("at least `wm_loss_steps`, 10"));
-        let settings = Settings {
+        let settings = WorldModelSettings {
             tilted: f64::NAN,
-            ..Settings::default()
+            ..WorldModelSettings::default()
         };
         assert!(error(settings).contains("`tilted`"));
     }
 
     #[test]
     fn one_period_comes_first_and_the_step_size_falls() {
-        let settings = Settings {
+        let settings = WorldModelSettings {
             steps: 100,
-            ..Settings::default()
+            ..WorldModelSettings::default()
         };
         assert_eq!(
             [0, 69, 70, 99].map(|s| settings.loss_steps(s)),

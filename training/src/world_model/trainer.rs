@@ -19,7 +19,7 @@ use super::{
     learner::{UpdateStatistics, WorldModelLearner},
     replay::{Replay, Start},
     sequences::Sequences,
-    settings::Settings,
+    settings::WorldModelSettings,
 };
 use crate::{
     equipment::Equipment,
@@ -34,7 +34,7 @@ const RUN_KIND: &str = "world-model-run";
 const ENVIRONMENTS: &str = "environments";
 const REPLAY: &str = "replay";
 
-/// Moments from which scaling follows, at most.
+/// Sequences from which scaling follows, at most.
 const SAMPLE: usize = 20_000;
 
 /// Columns of the log after the step.
@@ -51,7 +51,7 @@ const COLUMNS: [&str; 7] = [
 /// A run: the learner, its environments, and how far they are.
 pub struct Trainer {
     equipment: Equipment,
-    settings: Settings,
+    settings: WorldModelSettings,
     explorer: Explorer,
     replay: Replay,
     learner: WorldModelLearner,
@@ -60,7 +60,7 @@ pub struct Trainer {
 /// What a run's checkpoint says of its progress.
 #[derive(Serialize, Deserialize)]
 struct Saved {
-    settings: Settings,
+    settings: WorldModelSettings,
     steps: u64,
 }
 
@@ -82,7 +82,7 @@ impl Trainer {
     ///
     /// # Errors
     /// When a setting is out of bounds.
-    pub fn new(equipment: Equipment, settings: Settings) -> Result<Self> {
+    pub fn new(equipment: Equipment, settings: WorldModelSettings) -> Result<Self> {
         let (mut explorer, mut replay) = empty(&equipment, &settings)?;
         for _ in 0..settings.warm_up {
             explorer.collect(settings.frames, &mut replay)?;
@@ -96,7 +96,7 @@ impl Trainer {
 
     fn with(
         equipment: Equipment,
-        settings: Settings,
+        settings: WorldModelSettings,
         explorer: Explorer,
         replay: Replay,
         sample: &Sequences,
@@ -115,7 +115,7 @@ impl Trainer {
     ///
     /// # Errors
     /// When the checkpoint is damaged, or its run had other settings or another robot.
-    pub fn resume(equipment: Equipment, settings: Settings, path: &Path) -> Result<Self> {
+    pub fn resume(equipment: Equipment, settings: WorldModelSettings, path: &Path) -> Result<Self> {
         let (metadata, mut tensors) = checkpoint::load(path)?;
         metadata.check(path, &run_metadata(&equipment.robot))?;
         let saved: Saved = serde_json::from_value(metadata.training)
@@ -132,7 +132,7 @@ impl Trainer {
 
     fn restored(
         equipment: Equipment,
-        settings: Settings,
+        settings: WorldModelSettings,
         steps: u64,
         tensors: &mut Tensors,
     ) -> Result<Self> {
@@ -283,7 +283,7 @@ impl Round {
 }
 
 /// Environments and nothing collected.
-fn empty(equipment: &Equipment, settings: &Settings) -> Result<(Explorer, Replay)> {
+fn empty(equipment: &Equipment, settings: &WorldModelSettings) -> Result<(Explorer, Replay)> {
     settings.check()?;
     let (episodes, count) = (settings.episodes, settings.environments);
     let environments = equipment.environments(episodes, count, settings.seed)?;

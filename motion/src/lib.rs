@@ -17,6 +17,7 @@ mod error;
 mod frame;
 pub mod joint_csv;
 pub mod key_nodes;
+mod minimum_jerk;
 mod npz;
 mod resample;
 pub mod skills;
@@ -28,6 +29,7 @@ pub use bvh::{BvhOptions, UpAxis};
 pub use clip::Clip;
 pub use error::{FrameError, MotionError};
 pub use frame::{BoneLengths, KEY_NODES, KeyNode, KeyNodeFrame, Side};
+pub use minimum_jerk::{MINIMUM_JERK_PEAK, minimum_jerk};
 
 /// How deep a folder of motions may be nested.
 const MAX_FOLDER_DEPTH: usize = 32;

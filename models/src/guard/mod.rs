@@ -27,7 +27,7 @@ pub use execution::{Execution, ExecutionGuard};
 pub use goal::{GoalGuard, GoalInput, GoalPhase, RampCause};
 
 /// Largest slope of [`minimum_jerk`], at its middle.
-const PEAK_SLOPE: f32 = 1.875;
+const PEAK_SLOPE: f32 = emp_motion::MINIMUM_JERK_PEAK as f32;
 
 /// Share of a joint's speed limit that a ramp may take; the rest is left to the motion that it leads to.
 pub const RAMP_SPEED: f32 = 0.25;
@@ -43,10 +43,9 @@ pub struct GuardSettings {
     pub return_after: Duration,
 }
 
-/// The minimum-jerk course from 0 to 1, at rest at both ends: 10 τ³ − 15 τ⁴ + 6 τ⁵.
-pub fn minimum_jerk(progress: f32) -> f32 {
-    let t = progress.clamp(0.0, 1.0);
-    t * t * t * (10.0 + t * (6.0 * t - 15.0))
+/// [`emp_motion::minimum_jerk`] in single precision.
+fn minimum_jerk(progress: f32) -> f32 {
+    emp_motion::minimum_jerk(f64::from(progress)) as f32
 }
 
 /// A blend over a number of control periods.

@@ -78,16 +78,6 @@ fn ramping(cause: RampCause, progress: f32) -> GoalPhase {
 }
 
 #[test]
-fn minimum_jerk_starts_and_ends_at_rest() {
-    assert_eq!(minimum_jerk(0.0), 0.0);
-    assert_eq!(minimum_jerk(0.5), 0.5);
-    assert_eq!(minimum_jerk(1.0), 1.0);
-    let slope = |t: f32| (minimum_jerk(t + 1e-3) - minimum_jerk(t - 1e-3)) / 2e-3;
-    assert!(slope(1e-3) < 1e-3 && slope(1.0 - 1e-3) < 1e-3);
-    assert!((slope(0.5) - PEAK_SLOPE).abs() < 1e-2);
-}
-
-#[test]
 fn the_first_frame_begins_at_the_measured_pose_and_ends_at_the_goal() {
     let mut bench = Bench::new();
     let (goal, phase) = bench.step(0.3, FRESH);

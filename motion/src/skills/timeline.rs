@@ -3,11 +3,10 @@
 use nalgebra::Vector3;
 
 use super::body::{ArmPose, Body, Pose};
+use crate::{MINIMUM_JERK_PEAK, minimum_jerk};
 
 /// Frames a second of procedural clips.
 pub(super) const FPS: f64 = 50.0;
-/// Peak over mean speed of a minimum-jerk move.
-const PEAK_OVER_MEAN: f64 = 1.875;
 /// No move is shorter, seconds.
 const SHORTEST_MOVE: f64 = 0.2;
 /// Longest rise and fall of a cycle, seconds.
@@ -44,7 +43,7 @@ impl Timeline {
         let path = |i: usize| path_length(&from.arms[i].hand, &to.arms[i].hand);
         let trunk = (to.yaw - from.yaw).abs().max((to.lean - from.lean).abs());
         let metres = (path(0).max(path(1)) + trunk) * self.arm_length;
-        let count = frames((PEAK_OVER_MEAN * metres / peak_speed).max(SHORTEST_MOVE));
+        let count = frames((MINIMUM_JERK_PEAK * metres / peak_speed).max(SHORTEST_MOVE));
         self.poses.extend(
             (1..=count).map(|i| between(&from, &to, minimum_jerk(i as f64 / count as f64))),
         );
@@ -73,11 +72,6 @@ impl Timeline {
 
 fn frames(seconds: f64) -> usize {
     (seconds * FPS).round().max(1.0) as usize
-}
-
-/// 0 to 1 with velocity and acceleration zero at both ends.
-fn minimum_jerk(s: f64) -> f64 {
-    s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
 }
 
 /// Length of the path that [`hand_between`] takes, about, in arm lengths.

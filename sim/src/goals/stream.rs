@@ -1,5 +1,6 @@
 //! Endless goals for training.
 
+use emp_motion::{MINIMUM_JERK_PEAK, minimum_jerk};
 use rand::{Rng, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -13,8 +14,6 @@ const JOIN_SPEED: [f32; 2] = [1.0, 4.0];
 const SHORTEST_JOIN: usize = 15;
 /// Control periods in which the motion of the piece before fades, and that of the piece after is taken up.
 const FADE: f32 = (SHORTEST_JOIN + 1) as f32;
-/// Peak speed over mean speed of a minimum-jerk movement from rest to rest.
-const PEAK_TO_MEAN: f32 = 1.875;
 
 /// An endless sequence of goals: random pieces of clips of up to 60 frames, each mirrored or not, faster or slower,
 /// wider or narrower about the default pose, joined by minimum-jerk movements that keep position and velocity
@@ -164,7 +163,7 @@ impl Join {
         let to = State::new(library, to, 0, [0, 1.min(to.frames - 1)]);
         let ways = from.moved(faded(1.0)).zip(to.moved(-faded(1.0)));
         let farthest = ways.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        let frames = PEAK_TO_MEAN * farthest / (speed * library.period);
+        let frames = MINIMUM_JERK_PEAK as f32 * farthest / (speed * library.period);
         Self {
             frames: SHORTEST_JOIN.max(frames.ceil() as usize),
             from,
@@ -175,7 +174,7 @@ impl Join {
     /// Goal `t` of the movement: from the fading motion before, by a minimum-jerk weight, to the growing motion after.
     fn goal(&self, library: &GoalLibrary, t: usize, goal: &mut [f32]) {
         let (passed, left) = ((t + 1) as f32, (self.frames - t) as f32);
-        let weight = minimum_jerk(passed / (passed + left));
+        let weight = minimum_jerk(f64::from(passed / (passed + left))) as f32;
         let from = self.from.moved(faded(passed / FADE));
         let to = self.to.moved(-faded(left / FADE));
         for (((goal, joint), from), to) in goal.iter_mut().zip(&library.joints).zip(from).zip(to) {
@@ -206,11 +205,6 @@ impl State {
         let joints = self.position.iter().zip(&self.velocity);
         joints.map(move |(position, velocity)| position + periods * velocity)
     }
-}
-
-/// Share of the way from one point to another at time `s` in 0..1: no velocity and no acceleration at either end.
-fn minimum_jerk(s: f32) -> f32 {
-    s * s * s * (10.0 + s * (6.0 * s - 15.0))
 }
 
 /// Control periods' worth of its first velocity that a motion covers while it comes to rest smoothly over [`FADE`],

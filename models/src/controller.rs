@@ -4,6 +4,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::UnitQuaternion;
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -14,6 +15,10 @@ use crate::{
     observation::{History, ObservationLayout, RobotState},
     policy::Policy,
 };
+
+/// Answers after which a robot that stands at the last one stands still: a learned filter's answer depends on where the robot
+/// is.
+const SETTLING: usize = 3;
 
 /// One robot's past.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -222,6 +227,39 @@ impl Controller {
 
     fn layout(&self) -> &ObservationLayout {
         self.policy.layout()
+    }
+
+    /// The goals that robots execute which were long asked for `goals` (rad, one a robot) and stand at rest there, legs in
+    /// their default pose: the filter's own answers, each with the robot at the answer before. A filter that only slows motion
+    /// down leaves them as they are.
+    ///
+    /// # Errors
+    /// As of [`step`](Self::step).
+    pub fn settled_goals(&self, goals: &[&[f32]]) -> Result<Vec<Vec<f32>>, ModelError> {
+        let mut settled: Vec<Vec<f32>> = goals.iter().map(|goal| goal.to_vec()).collect();
+        let Some(filter) = &self.filter else {
+            return Ok(settled);
+        };
+        let legs = self.policy.robot().leg_joints().iter();
+        let legs: Vec<f32> = legs.map(|joint| joint.default as f32).collect();
+        for _ in 0..SETTLING {
+            let poses: Vec<Vec<f32>> = settled
+                .iter()
+                .map(|goal| goal.iter().chain(&legs).copied().collect())
+                .collect();
+            let mut robots = vec![self.state(); goals.len()];
+            let inputs = poses.iter().zip(goals).map(|(pose, goal)| ControllerInput {
+                state: RobotState {
+                    joint_positions: pose,
+                    orientation: UnitQuaternion::identity(),
+                },
+                goal,
+            });
+            let mut batch: Vec<_> = robots.iter_mut().zip(inputs).collect();
+            let answers = filter_goals(self.layout(), Some(filter.as_ref()), &mut batch)?;
+            settled = answers.into_iter().map(|answer| answer.goal).collect();
+        }
+        Ok(settled)
     }
 
     /// One control period of a batch of robots.

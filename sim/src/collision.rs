@@ -1,6 +1,6 @@
 //! Contacts of a robot with itself.
 
-use std::collections::HashMap;
+use std::collections::HashSet;
 
 use emp_robot::Robot;
 use mujoco_rs::prelude::*;
@@ -11,18 +11,15 @@ use crate::SimError;
 /// The base hangs this far above its standing height, metres: the floor is out of reach.
 const LIFT: f64 = 1.0;
 
-/// The pairs of geoms whose contact is a self-collision, by their numbers in a model: from both, the smaller first, to
-/// the one that the robot names first.
+/// The pairs of geoms whose contact is a self-collision, by their numbers in a model, the smaller first.
 #[derive(Debug)]
-pub(crate) struct ContactPairs(HashMap<[i32; 2], i32>);
+pub(crate) struct ContactPairs(HashSet<[i32; 2]>);
 
 impl ContactPairs {
     pub(crate) fn new(robot: &Robot, model: &MjModel) -> Result<Self, SimError> {
         let id = |geom: &String| geom_id(model, geom).map(|id| id as i32);
-        let pairs = robot.contact_pairs().iter().map(|[first, second]| {
-            let first = id(first)?;
-            Ok((ordered([first, id(second)?]), first))
-        });
+        let pairs = robot.contact_pairs().iter();
+        let pairs = pairs.map(|[first, second]| Ok(ordered([id(first)?, id(second)?])));
         Ok(Self(pairs.collect::<Result<_, SimError>>()?))
     }
 
@@ -33,10 +30,10 @@ impl ContactPairs {
             .any(|contact| self.touching(contact).is_some())
     }
 
-    /// The geom that the robot names first of the pair that touches here, if one does.
-    pub(crate) fn touching(&self, contact: &MjContact) -> Option<i32> {
+    /// The pair that touches here, the smaller number first, if one does.
+    pub(crate) fn touching(&self, contact: &MjContact) -> Option<[i32; 2]> {
         let pair = (contact.dist <= 0.0).then(|| ordered(contact.geom))?;
-        self.0.get(&pair).copied()
+        self.0.contains(&pair).then_some(pair)
     }
 }
 
@@ -195,6 +192,47 @@ mod tests {
             // The contact pushes the hands off, the servos press them on again.
             assert!(touched.count() >= 5, "{}", robot.name());
         });
+    }
+
+    /// Mean contact force over some control periods with the arms of these sides pressed on, N.
+    fn pressed_by(robot: &Robot, sides: &[&str]) -> f64 {
+        let (hanging, pressed) = (pose(robot, &[]), pressed(robot));
+        let joints = robot.goal_joints().iter().zip(hanging.iter().zip(&pressed));
+        let goal: Vec<f32> = joints
+            .map(|(joint, (&hanging, &pressed))| {
+                let is_pressed = sides.iter().any(|side| joint.name.starts_with(side));
+                if is_pressed { pressed } else { hanging }
+            })
+            .collect();
+        let legs = robot.leg_joints().iter().map(|joint| joint.default as f32);
+        let legs: Vec<f32> = legs.collect();
+        let angles: Vec<f64> = goal.iter().chain(&legs).map(|&a| f64::from(a)).collect();
+        let mut stage = Stage::new(robot).unwrap();
+        let mut body = stage.place(&Start {
+            joint_positions: &angles,
+            lift: 0.0,
+            parameters: BodyParameters::default(),
+        });
+        let targets = Targets {
+            goal: &goal,
+            legs: &legs,
+        };
+        let forces = (0..10).map(|_| stage.step(&mut body, &targets).self_contact.force);
+        forces.sum::<f64>() / 10.0
+    }
+
+    #[test]
+    fn two_hands_that_press_from_both_sides_do_not_cancel() {
+        let robot = crate::testing::emp27();
+        let [left, right] = [["left"], ["right"]].map(|side| pressed_by(&robot, &side));
+        let both = pressed_by(&robot, &["left", "right"]);
+        assert!(left > 5.0 && right > 5.0, "{left} {right}");
+        // As vectors the two would add up to nearly nothing.
+        assert!(
+            (both / (left + right) - 1.0).abs() < 0.1,
+            "{both} {left} {right}"
+        );
+        assert_eq!(pressed_by(&robot, &[]), 0.0);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::evaluation::{Evaluation, EvaluationSettings, Progress, evaluate};
 use crate::goals::GoalClip;
-use crate::metrics::{Interval, Metrics};
+use crate::metrics::{Interval, LIST, Metric, Metrics, headings};
 use crate::pushes::Kick;
 use crate::{Pool, SimError};
 
@@ -106,6 +106,8 @@ pub struct LadderRow {
     pub rung: Rung,
     /// Number of episodes.
     pub episodes: usize,
+    /// Number of motions that they play: what the intervals rest on.
+    pub motions: usize,
     /// The metrics.
     #[serde(flatten)]
     pub metrics: Metrics<Interval>,
@@ -156,6 +158,7 @@ pub fn climb(
                 controller: controller.name().to_owned(),
                 rung: *rung,
                 episodes: known[index].all.episodes,
+                motions: known[index].all.motions,
                 metrics: known[index].all.metrics,
             });
             ladder.rows.last().into_iter().for_each(&mut row);
@@ -165,22 +168,23 @@ pub fn climb(
 }
 
 impl Ladder {
-    /// The rows as CSV: controller, axis, value, episodes, then each metric's mean, low and high end.
+    /// The rows as CSV: controller, axis, value, episodes, motions, then each metric's mean, low and high end.
     pub fn csv(&self) -> String {
-        let metrics = Metrics::<Interval>::NAMES;
-        let columns = metrics.map(|name| format!("{name},{name}_low,{name}_high"));
-        let mut csv = format!("controller,axis,value,episodes,{}\n", columns.join(","));
+        let columns = LIST.map(|Metric { name, .. }| format!("{name},{name}_low,{name}_high"));
+        let columns = columns.join(",");
+        let mut csv = format!("controller,axis,value,episodes,motions,{columns}\n");
         for row in &self.rows {
             let numbers = row.metrics.array();
             let numbers =
                 numbers.map(|metric| format!("{},{},{}", metric.mean, metric.low, metric.high));
             // A controller's parameters have commas.
             csv += &format!(
-                "\"{}\",{},{},{},{}\n",
+                "\"{}\",{},{},{},{},{}\n",
                 row.controller,
                 row.rung.axis.name(),
                 row.rung.value,
                 row.episodes,
+                row.motions,
                 numbers.join(",")
             );
         }
@@ -190,34 +194,23 @@ impl Ladder {
 
 impl fmt::Display for Ladder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let headings = headings();
         writeln!(
             f,
-            "| controller | axis | value | SUC (95 %) | MJP | MSC N | self-collision | MBV | MBA | MBO | MUS |"
+            "| controller | axis | value | clips of motions | {} |",
+            headings.join(" | ")
         )?;
-        writeln!(f, "|---|---|---|---|---|---|---|---|---|---|---|")?;
-        for LadderRow {
-            controller,
-            rung,
-            metrics,
-            ..
-        } in &self.rows
-        {
-            let suc = metrics.suc;
+        writeln!(f, "|---|---|---|---|{}", "---|".repeat(headings.len()))?;
+        for row in &self.rows {
             writeln!(
                 f,
-                "| {controller} | {} | {:.2} | {:.3} ({:.3}–{:.3}) | {:.3} | {:.2} | {:.4} | {:.3} | {:.3} | {:.3} | {:.3} |",
-                rung.axis.name(),
-                rung.value,
-                suc.mean,
-                suc.low,
-                suc.high,
-                metrics.mjp.mean,
-                metrics.msc.mean,
-                metrics.self_collision_share.mean,
-                metrics.mbv.mean,
-                metrics.mba.mean,
-                metrics.mbo.mean,
-                metrics.mus.mean
+                "| {} | {} | {:.2} | {} of {} | {} |",
+                row.controller,
+                row.rung.axis.name(),
+                row.rung.value,
+                row.episodes,
+                row.motions,
+                row.metrics.cells().join(" | ")
             )?;
         }
         Ok(())

@@ -38,6 +38,7 @@ pub mod metrics;
 mod physics;
 mod pool;
 pub mod pushes;
+pub mod quantile;
 mod ranges;
 mod skeleton;
 pub mod suite;

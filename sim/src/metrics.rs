@@ -1,5 +1,11 @@
 //! The paper's metrics (section VI), and what a filter takes for them, over the executed frames of each episode: those up to
 //! and including the fall, or the clip's end.
+//!
+//! Clips of one recording, and one clip under several conditions, are not independent. The interval of SUC is Clopper and
+//! Pearson's over episodes; every other interval, and every paired difference, comes from resampling whole *motions*
+//! (recordings and procedural motions), each with all its clips and conditions.
+
+use std::collections::HashMap;
 
 use emp_models::observation::roll_pitch_yaw;
 use rand::{RngExt as _, SeedableRng as _};
@@ -7,111 +13,130 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::Reading;
+use crate::quantile::quantile;
 
 /// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
 /// Ends of a 95 % interval.
 const QUANTILES: [f64; 2] = [0.025, 0.975];
+/// Halvings by which an end of SUC's interval is found, to a billionth.
+const HALVINGS: usize = 30;
 
-/// Number of metrics.
-pub const METRICS: usize = 12;
-
-/// One value for each metric.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Metrics<T> {
-    /// Share of episodes in which the robot stood to the end; more is better.
-    pub suc: T,
-    /// exp(−‖q − g‖₂) over the goal joints, g the goal that was asked for, rad; more is better.
-    pub mjp: T,
-    /// Norm of the summed contact force between the robot's own links, N; less is better.
-    pub msc: T,
-    /// Share of frames in which such links touched; less is better.
-    pub self_collision_share: T,
-    /// exp(−10 ‖v‖₂²), v the base's velocity, m/s; more is better.
-    pub mbv: T,
-    /// `exp(−3 ‖v_t − v_{t−1}‖₂)`; more is better.
-    pub mba: T,
-    /// exp(−10 (|roll| + |pitch|)); more is better.
-    pub mbo: T,
-    /// `‖q̇_t − q̇_{t−1}‖₂²` over the goal joints, (rad/s)²; less is better.
-    pub mus: T,
-    /// Mean of |ĝ − g| over the goal joints, ĝ the goal that was executed, rad; less is better.
-    pub change: T,
-    /// `‖ĝ − g‖₂ / ‖g − g₀‖₂` over all frames at once (relL2), g₀ the default pose; less is better.
-    pub relative_change: T,
-    /// (g − ĝ)·(g − g₀) / ‖g − g₀‖₂² over all frames at once: the share of the motion's amplitude that is lost; less is
-    /// better.
-    pub amplitude_loss: T,
-    /// Share of frames in which ĝ was not g.
-    pub changed_share: T,
+/// Which way a metric should go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Better {
+    /// Up.
+    More,
+    /// Down.
+    Less,
 }
 
-impl<T> Metrics<T> {
-    /// Names of the metrics, in the order of the fields.
-    pub const NAMES: [&'static str; METRICS] = [
-        "suc",
-        "mjp",
-        "msc",
-        "self_collision_share",
-        "mbv",
-        "mba",
-        "mbo",
-        "mus",
-        "change",
-        "relative_change",
-        "amplitude_loss",
-        "changed_share",
-    ];
+/// What a metric is called.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Metric {
+    /// As in JSON and CSV.
+    pub name: &'static str,
+    /// As a table's column says.
+    pub label: &'static str,
+    /// Its unit; empty if it has none.
+    pub unit: &'static str,
+    /// Which way it should go.
+    pub better: Better,
+}
 
-    /// The values in the order of the fields.
-    pub fn array(self) -> [T; METRICS] {
-        [
-            self.suc,
-            self.mjp,
-            self.msc,
-            self.self_collision_share,
-            self.mbv,
-            self.mba,
-            self.mbo,
-            self.mus,
-            self.change,
-            self.relative_change,
-            self.amplitude_loss,
-            self.changed_share,
-        ]
+/// Declares the metrics once: the struct, its order and [`LIST`].
+macro_rules! metrics {
+    ($($(#[$doc:meta])* $name:ident: $label:literal, $unit:literal, $better:ident;)+) => {
+        /// One value for each metric.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+        pub struct Metrics<T> {
+            $($(#[$doc])* pub $name: T,)+
+        }
+
+        /// Number of metrics.
+        pub const METRICS: usize = [$(stringify!($name)),+].len();
+
+        /// The metrics in the order of the fields of [`Metrics`].
+        pub const LIST: [Metric; METRICS] = [$(Metric {
+            name: stringify!($name),
+            label: $label,
+            unit: $unit,
+            better: Better::$better,
+        }),+];
+
+        impl<T> Metrics<T> {
+            /// The values in the order of [`LIST`].
+            pub fn array(self) -> [T; METRICS] {
+                [$(self.$name),+]
+            }
+        }
+
+        impl<T> From<[T; METRICS]> for Metrics<T> {
+            fn from([$($name),+]: [T; METRICS]) -> Self {
+                Self { $($name),+ }
+            }
+        }
+    };
+}
+
+metrics! {
+    /// Share of episodes in which the robot stood to the end.
+    suc: "SUC", "", More;
+    /// exp(−‖q − g‖₂) over the goal joints, g the goal that was asked for, rad.
+    mjp: "MJP", "", More;
+    /// Sum over touching pairs of the robot's own links of the norm of their contact force, N (erratum E6).
+    msc: "MSC", "N", Less;
+    /// Share of frames in which such links touched.
+    self_collision_share: "self-collision", "", Less;
+    /// exp(−10 ‖v‖₂²), v the base's velocity, m/s.
+    mbv: "MBV", "", More;
+    /// `exp(−3 ‖v_t − v_{t−1}‖₂)`.
+    mba: "MBA", "", More;
+    /// exp(−10 (|roll| + |pitch|)).
+    mbo: "MBO", "", More;
+    /// `‖q̇_t − q̇_{t−1}‖₂²` over the goal joints, (rad/s)².
+    mus: "MUS", "(rad/s)²", Less;
+    /// Mean of |ĝ − g| over the goal joints, ĝ the goal that was executed, rad.
+    change: "mean change", "rad", Less;
+    /// `‖ĝ − g‖₂ / ‖g − g₀‖₂` over all frames at once (relL2), g₀ the default pose.
+    relative_change: "relL2", "", Less;
+    /// (g − ĝ)·(g − g₀) / ‖g − g₀‖₂² over all frames at once: the share of the motion's amplitude that is lost.
+    amplitude_loss: "amplitude lost", "", Less;
+    /// Share of frames in which ĝ was not g.
+    changed_share: "frames changed", "", Less;
+}
+
+impl Metric {
+    /// The head of a table's column: label, unit and direction.
+    pub fn heading(&self) -> String {
+        let arrow = match self.better {
+            Better::More => "↑",
+            Better::Less => "↓",
+        };
+        let parts = [self.label, self.unit, arrow];
+        let parts = parts.into_iter().filter(|part| !part.is_empty());
+        parts.collect::<Vec<_>>().join(" ")
     }
 }
 
-impl<T> From<[T; METRICS]> for Metrics<T> {
-    fn from(values: [T; METRICS]) -> Self {
-        let [
-            suc,
-            mjp,
-            msc,
-            self_collision_share,
-            mbv,
-            mba,
-            mbo,
-            mus,
-            change,
-            relative_change,
-            amplitude_loss,
-            changed_share,
-        ] = values;
-        Self {
-            suc,
-            mjp,
-            msc,
-            self_collision_share,
-            mbv,
-            mba,
-            mbo,
-            mus,
-            change,
-            relative_change,
-            amplitude_loss,
-            changed_share,
-        }
+/// The paper's metrics: the first of [`LIST`], which a table of results shows.
+const PAPER: usize = 8;
+
+/// Heads of a results table's columns: those of the paper's metrics, SUC's with its interval.
+pub fn headings() -> [String; PAPER] {
+    let mut headings = std::array::from_fn(|metric| LIST[metric].heading());
+    headings[0] += " (95 %)";
+    headings
+}
+
+impl Metrics<Interval> {
+    /// The cells below [`headings`].
+    pub fn cells(&self) -> [String; PAPER] {
+        let values = self.array();
+        std::array::from_fn(|metric| match (metric, values[metric]) {
+            (0, Interval { mean, low, high }) => format!("{mean:.3} ({low:.3}–{high:.3})"),
+            (_, Interval { mean, .. }) => format!("{mean:.3}"),
+        })
     }
 }
 
@@ -155,7 +180,7 @@ impl EpisodeSums {
         let sums = &mut self.sums;
         self.frames += 1;
         sums.mjp += (-square_distance(&reading.joint_positions, goal).sqrt()).exp();
-        sums.msc += reading.self_contact.force.norm();
+        sums.msc += reading.self_contact.force;
         sums.self_collision_share += f64::from(u8::from(reading.self_contact.touched));
         sums.mbv += (-10.0 * reading.linear_velocity.norm_squared()).exp();
         sums.mba += (-3.0 * reading.velocity_change.norm()).exp();
@@ -178,7 +203,9 @@ impl EpisodeSums {
 
     /// The episode's own metrics: means over its frames.
     pub fn means(&self) -> Metrics<f64> {
-        means([self])
+        let mut total = Total::default();
+        total.add(self);
+        total.means()
     }
 }
 
@@ -188,34 +215,100 @@ fn square_distance(a: &[f32], b: &[f32]) -> f64 {
     differences.map(|difference| difference * difference).sum()
 }
 
-/// SUC over the episodes, the other metrics over all their frames; 0 of none.
-fn means<'a>(episodes: impl IntoIterator<Item = &'a EpisodeSums>) -> Metrics<f64> {
-    let (mut count, mut frames, mut amplitude) = (0, 0, 0.0);
-    let mut sums = [0.0; METRICS];
-    for episode in episodes {
-        count += 1;
-        frames += episode.frames;
-        amplitude += episode.amplitude;
-        for (sum, value) in sums.iter_mut().zip(episode.sums.array()) {
+/// What several episodes add up to.
+#[derive(Clone, Copy, Debug, Default)]
+struct Total {
+    episodes: f64,
+    frames: f64,
+    amplitude: f64,
+    sums: [f64; METRICS],
+}
+
+impl Total {
+    fn add(&mut self, episode: &EpisodeSums) {
+        self.episodes += 1.0;
+        self.frames += episode.frames as f64;
+        self.amplitude += episode.amplitude;
+        for (sum, value) in self.sums.iter_mut().zip(episode.sums.array()) {
             *sum += value;
         }
     }
-    let sums = Metrics::from(sums);
-    let of_amplitude = |sum: f64| {
-        if amplitude > 0.0 {
-            sum / amplitude
-        } else {
-            0.0
+
+    /// All of them together.
+    fn of<'a>(totals: impl IntoIterator<Item = &'a Self>) -> Self {
+        let mut all = Self::default();
+        for total in totals {
+            all.episodes += total.episodes;
+            all.frames += total.frames;
+            all.amplitude += total.amplitude;
+            for (sum, value) in all.sums.iter_mut().zip(total.sums) {
+                *sum += value;
+            }
         }
-    };
-    let mut means = Metrics::from(sums.array().map(|sum| sum / frames.max(1) as f64));
-    means.suc = sums.suc / f64::from(count.max(1));
-    means.relative_change = of_amplitude(sums.relative_change).sqrt();
-    means.amplitude_loss = of_amplitude(sums.amplitude_loss);
-    means
+        all
+    }
+
+    fn failures(&self) -> f64 {
+        self.episodes - Metrics::from(self.sums).suc
+    }
+
+    /// SUC over the episodes, the other metrics over all their frames; 0 of none.
+    fn means(&self) -> Metrics<f64> {
+        let share = |sum: f64, of: f64| if of > 0.0 { sum / of } else { 0.0 };
+        let sums = Metrics::from(self.sums);
+        let mut means = Metrics::from(self.sums.map(|sum| share(sum, self.frames)));
+        means.suc = share(sums.suc, self.episodes);
+        means.relative_change = share(sums.relative_change, self.amplitude).sqrt();
+        means.amplitude_loss = share(sums.amplitude_loss, self.amplitude);
+        means
+    }
 }
 
-/// A mean and its 95 % bootstrap interval.
+/// One episode: which motion it played, and what its frames add up to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sample {
+    /// The recording or procedural motion; episodes of one are not independent.
+    pub motion: String,
+    /// What the frames add up to.
+    pub sums: EpisodeSums,
+}
+
+/// The totals of each motion, in the order in which motions first appear.
+fn by_motion(samples: &[Sample]) -> Vec<Total> {
+    let mut places: HashMap<&str, usize> = HashMap::new();
+    let mut totals = Vec::new();
+    for Sample { motion, sums } in samples {
+        let place = *places.entry(motion).or_insert(totals.len());
+        if place == totals.len() {
+            totals.push(Total::default());
+        }
+        totals[place].add(sums);
+    }
+    totals
+}
+
+/// Number of motions among the episodes: of what an interval rests on.
+pub fn motions(samples: &[Sample]) -> usize {
+    by_motion(samples).len()
+}
+
+/// Number of episodes in which the robot did not stand to the end.
+pub fn failures(samples: &[Sample]) -> usize {
+    let failed = |sample: &&Sample| sample.sums.sums.suc == 0.0;
+    samples.iter().filter(failed).count()
+}
+
+/// The totals of each motion, ours and theirs.
+fn pairs(ours: &[Sample], theirs: &[Sample]) -> Vec<[Total; 2]> {
+    let motions = |samples: &[Sample]| -> Vec<String> {
+        samples.iter().map(|sample| sample.motion.clone()).collect()
+    };
+    assert_eq!(motions(ours), motions(theirs), "episodes come in pairs");
+    let pairs = by_motion(ours).into_iter().zip(by_motion(theirs));
+    pairs.map(|(ours, theirs)| [ours, theirs]).collect()
+}
+
+/// A mean and its 95 % interval.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
     /// The mean.
@@ -226,60 +319,113 @@ pub struct Interval {
     pub high: f64,
 }
 
-/// The metrics of a set of episodes, with intervals from resampling whole episodes; zeros of none.
-///
-/// The same episodes and seed give the same numbers. Where every episode succeeds (or fails), so does every resample: the
-/// interval of `suc` is then a point.
-pub fn summary(episodes: &[EpisodeSums], seed: u64) -> Metrics<Interval> {
-    let statistic = |sample: &[usize]| means(sample.iter().map(|&i| &episodes[i])).array();
-    intervals(episodes.len(), seed, statistic).into()
+/// The metrics of a set of episodes: SUC with Clopper and Pearson's interval over episodes, the others with intervals from
+/// resampling motions; zeros of none. The same episodes and seed give the same numbers.
+pub fn summary(samples: &[Sample], seed: u64) -> Metrics<Interval> {
+    let totals = by_motion(samples);
+    let statistic = |sample: &[usize]| {
+        let chosen = sample.iter().map(|&motion| &totals[motion]);
+        Total::of(chosen).means().array()
+    };
+    let mut summary = Metrics::from(intervals(totals.len(), seed, statistic));
+    let all = Total::of(&totals);
+    summary.suc = clopper_pearson(all.episodes - all.failures(), all.episodes);
+    summary
 }
 
-/// The difference `ours − theirs` of the metrics on the same episodes, pair by pair: intervals from resampling the pairs.
+/// The difference `ours − theirs` of the metrics on the same episodes, pair by pair: intervals from resampling motions.
 ///
 /// # Panics
-/// If there are not as many of the one as of the other.
-pub fn paired_difference(
-    ours: &[EpisodeSums],
-    theirs: &[EpisodeSums],
-    seed: u64,
-) -> Metrics<Interval> {
-    assert_eq!(ours.len(), theirs.len(), "episodes come in pairs");
+/// If the two are not on the same motions in the same order.
+pub fn paired_difference(ours: &[Sample], theirs: &[Sample], seed: u64) -> Metrics<Interval> {
+    let pairs = pairs(ours, theirs);
     let difference = |sample: &[usize]| {
-        let ours = means(sample.iter().map(|&i| &ours[i])).array();
-        let theirs = means(sample.iter().map(|&i| &theirs[i])).array();
+        let [ours, theirs] = [0, 1].map(|side| {
+            let chosen = sample.iter().map(|&motion| &pairs[motion][side]);
+            Total::of(chosen).means().array()
+        });
         std::array::from_fn(|metric| ours[metric] - theirs[metric])
     };
-    intervals(ours.len(), seed, difference).into()
+    intervals(pairs.len(), seed, difference).into()
 }
 
 /// The share of `theirs` failures that `ours` does without, on the same episodes: 1 − ours/theirs, with its interval from
-/// resampling the pairs; below 0 if there are more. None where they fail in no episode.
+/// resampling motions; below 0 if there are more. None where they fail in no episode.
 ///
 /// # Panics
-/// If there are not as many of the one as of the other.
-pub fn failures_cut(ours: &[EpisodeSums], theirs: &[EpisodeSums], seed: u64) -> Option<Interval> {
-    assert_eq!(ours.len(), theirs.len(), "episodes come in pairs");
-    let failures = |episodes: &[EpisodeSums], sample: &[usize]| {
-        let stood: f64 = sample.iter().map(|&i| episodes[i].sums.suc).sum();
-        sample.len() as f64 - stood
-    };
+/// If the two are not on the same motions in the same order.
+pub fn failures_cut(ours: &[Sample], theirs: &[Sample], seed: u64) -> Option<Interval> {
+    let pairs = pairs(ours, theirs);
     let cut = |sample: &[usize]| {
-        let theirs = failures(theirs, sample);
+        let [ours, theirs] = [0, 1].map(|side| -> f64 {
+            let chosen = sample.iter().map(|&motion| pairs[motion][side].failures());
+            chosen.sum()
+        });
         // A resample without failures has none to cut.
-        let left = if theirs > 0.0 {
-            failures(ours, sample) / theirs
+        [if theirs > 0.0 {
+            1.0 - ours / theirs
         } else {
-            1.0
-        };
-        [1.0 - left]
+            0.0
+        }]
     };
-    let all: Vec<usize> = (0..theirs.len()).collect();
-    let [interval] = intervals(ours.len(), seed, cut);
-    (failures(theirs, &all) > 0.0).then_some(interval)
+    let failures: f64 = pairs.iter().map(|[_, theirs]| theirs.failures()).sum();
+    let [interval] = intervals(pairs.len(), seed, cut);
+    (failures > 0.0).then_some(interval)
 }
 
-/// Statistics of `count` episodes, with intervals from resampling the episodes.
+/// The exact interval of a share: the chances of success for which so many or more, and so many or fewer, are not rarer than
+/// 2.5 %.
+fn clopper_pearson(successes: f64, episodes: f64) -> Interval {
+    let (k, n) = (successes as usize, episodes as usize);
+    if n == 0 {
+        return Interval::default();
+    }
+    let [tail, _] = QUANTILES;
+    Interval {
+        mean: successes / episodes,
+        low: match k {
+            0 => 0.0,
+            _ => crossing(|chance| at_least(k, n, chance) < tail),
+        },
+        // So many or fewer successes are so many or more failures.
+        high: match n - k {
+            0 => 1.0,
+            failures => crossing(|chance| at_least(failures, n, 1.0 - chance) > tail),
+        },
+    }
+}
+
+/// The chance of at least `k` successes in `n` trials.
+fn at_least(k: usize, n: usize, chance: f64) -> f64 {
+    let (yes, no) = (chance.ln(), (1.0 - chance).ln());
+    let mut ways = 0.0; // Logarithm of the binomial coefficient.
+    let mut sum = 0.0;
+    for i in 0..=n {
+        if i > 0 {
+            ways += ((n - i + 1) as f64 / i as f64).ln();
+        }
+        if i >= k {
+            sum += (ways + i as f64 * yes + (n - i) as f64 * no).exp();
+        }
+    }
+    sum
+}
+
+/// The number between 0 and 1 below which `is_below` holds.
+fn crossing(is_below: impl Fn(f64) -> bool) -> f64 {
+    let (mut low, mut high) = (0.0, 1.0);
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (low + high);
+        if is_below(middle) {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
+/// A statistic of `count` motions, with intervals from resampling them.
 fn intervals<const N: usize>(
     count: usize,
     seed: u64,
@@ -300,20 +446,13 @@ fn intervals<const N: usize>(
     std::array::from_fn(|index| {
         let values = &mut resampled[index];
         values.sort_by(f64::total_cmp);
-        let [low, high] = QUANTILES.map(|share| quantile(values, share));
+        let [low, high] = QUANTILES.map(|share| quantile(values, share).unwrap_or_default());
         Interval {
             mean: whole[index],
             low,
             high,
         }
     })
-}
-
-/// The value below which a share of sorted values lies, interpolated between neighbours.
-fn quantile(sorted: &[f64], share: f64) -> f64 {
-    let at = share * (sorted.len() - 1) as f64;
-    let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);
-    below + at.fract() * (above - below)
 }
 
 #[cfg(test)]
@@ -330,7 +469,7 @@ mod tests {
             linear_velocity: Vector3::new(0.1, 0.0, -0.2),
             velocity_change: Vector3::new(0.0, 0.3, 0.4),
             self_contact: crate::SelfContact {
-                force: Vector3::new(3.0, -4.0, 12.0),
+                force: 13.0,
                 touched: true,
             },
             ..Reading::default()
@@ -346,7 +485,7 @@ mod tests {
     }
 
     fn close(a: Metrics<f64>, b: [f64; METRICS]) {
-        for ((name, a), b) in Metrics::<f64>::NAMES.iter().zip(a.array()).zip(b) {
+        for ((Metric { name, .. }, a), b) in LIST.iter().zip(a.array()).zip(b) {
             // Angles and speeds are single precision.
             assert!((a - b).abs() < 1e-6, "{name}: {a}, expected {b}");
         }
@@ -365,7 +504,7 @@ mod tests {
         let expected = [
             0.0,
             0.606_530_659_7, // exp(−0.5)
-            13.0,            // |(3, −4, 12)|
+            13.0,            //
             1.0,             //
             0.606_530_659_7, // exp(−10 · 0.05)
             0.223_130_160_1, // exp(−3 · 0.5)
@@ -411,19 +550,22 @@ mod tests {
             0.0,
             0.0,
         ];
-        close(means([&fell, &stood]), expected);
-        let summary = summary(&[fell, stood], 1);
+        let samples = [("a", fell), ("b", stood)].map(|(motion, sums)| Sample {
+            motion: motion.to_owned(),
+            sums,
+        });
+        let summary = summary(&samples, 1);
         close(
             Metrics::from(summary.array().map(|interval| interval.mean)),
             expected,
         );
-        // Resamples of two: both, or either one twice.
-        assert_eq!((summary.suc.low, summary.suc.high), (0.0, 1.0));
+        // Resamples of two motions: both, or either one twice.
         assert_eq!((summary.msc.low, summary.msc.high), (0.0, 13.0));
     }
 
-    fn coins(count: usize, heads: usize) -> Vec<EpisodeSums> {
-        let episode = |i: usize| EpisodeSums {
+    /// Episodes of a motion each.
+    fn coins(count: usize, heads: usize) -> Vec<Sample> {
+        let sums = |i: usize| EpisodeSums {
             frames: 100,
             sums: Metrics {
                 suc: f64::from(u8::from(i < heads)),
@@ -432,7 +574,11 @@ mod tests {
             },
             amplitude: 1.0,
         };
-        (0..count).map(episode).collect()
+        let sample = |i: usize| Sample {
+            motion: i.to_string(),
+            sums: sums(i),
+        };
+        (0..count).map(sample).collect()
     }
 
     #[test]
@@ -475,16 +621,52 @@ mod tests {
     }
 
     #[test]
-    fn the_interval_of_a_share_is_the_binomials() {
-        let summary = summary(&coins(400, 360), 7);
-        // 0.9 ± 1.96 · √(0.9 · 0.1 / 400)
-        assert!((summary.suc.low - 0.8706).abs() < 0.004, "{summary:?}");
-        assert!((summary.suc.high - 0.9294).abs() < 0.004, "{summary:?}");
-        assert_eq!(summary, super::summary(&coins(400, 360), 7));
-        assert_ne!(summary, super::summary(&coins(400, 360), 8));
-        let all = super::summary(&coins(50, 50), 7).suc;
-        assert_eq!((all.low, all.mean, all.high), (1.0, 1.0, 1.0));
-        assert_eq!(super::summary(&[], 7).suc, Interval::default());
+    fn the_interval_of_a_share_is_clopper_and_pearsons() {
+        for (heads, count, low, high) in [
+            (360, 400, 0.866_322, 0.927_594),
+            (155, 155, 0.976_482, 1.0),
+            (0, 10, 0.0, 0.308_497),
+            (1, 2, 0.012_579, 0.987_421),
+        ] {
+            let suc = summary(&coins(count, heads), 7).suc;
+            assert!((suc.low - low).abs() < 2e-6, "{heads} of {count}: {suc:?}");
+            assert!(
+                (suc.high - high).abs() < 2e-6,
+                "{heads} of {count}: {suc:?}"
+            );
+        }
+        assert_eq!(summary(&[], 7).suc, Interval::default());
+    }
+
+    #[test]
+    fn a_motion_played_ten_times_is_one_unit() {
+        let once = coins(20, 15);
+        let often: Vec<Sample> = (0..10).flat_map(|_| once.clone()).collect();
+        assert_eq!((motions(&once), motions(&often)), (20, 20));
+        let theirs = coins(20, 10);
+        let often_theirs: Vec<Sample> = (0..10).flat_map(|_| theirs.clone()).collect();
+        let near = |a: Interval, b: Interval| {
+            let pairs = [(a.mean, b.mean), (a.low, b.low), (a.high, b.high)];
+            assert!(
+                pairs.iter().all(|(a, b)| (a - b).abs() < 1e-12),
+                "{a:?} {b:?}"
+            );
+        };
+        near(summary(&once, 7).mjp, summary(&often, 7).mjp);
+        near(
+            failures_cut(&once, &theirs, 7).unwrap(),
+            failures_cut(&often, &often_theirs, 7).unwrap(),
+        );
+        near(
+            paired_difference(&once, &theirs, 7).suc,
+            paired_difference(&often, &often_theirs, 7).suc,
+        );
+        // Ten times as many motions would have told more.
+        let many = coins(200, 150);
+        let width = |interval: Interval| interval.high - interval.low;
+        assert!(width(summary(&many, 7).mjp) < 0.5 * width(summary(&often, 7).mjp));
+        assert_eq!(summary(&once, 7), summary(&once, 7));
+        assert_ne!(summary(&once, 7).mjp, summary(&once, 8).mjp);
     }
 
     #[test]
@@ -492,7 +674,7 @@ mod tests {
         let theirs = coins(200, 150);
         let mut ours = theirs.clone();
         for episode in &mut ours {
-            episode.sums.mjp += 0.2;
+            episode.sums.sums.mjp += 0.2;
         }
         let difference = paired_difference(&ours, &theirs, 3);
         assert!((difference.mjp.low - 0.002).abs() < 1e-12);
@@ -500,5 +682,15 @@ mod tests {
         assert_eq!(difference.suc, Interval::default());
         let apart = [summary(&ours, 3).mjp, summary(&theirs, 3).mjp];
         assert!(apart[0].low < apart[1].high, "they overlap");
+    }
+
+    #[test]
+    fn headings_say_unit_and_direction() {
+        assert_eq!(
+            headings().join(" | "),
+            "SUC ↑ (95 %) | MJP ↑ | MSC N ↓ | self-collision ↓ | MBV ↑ | MBA ↑ | MBO ↑ | MUS (rad/s)² ↓"
+        );
+        let cells = summary(&coins(400, 360), 7).cells();
+        assert_eq!(cells[..2], ["0.900 (0.866–0.928)", "0.820"]);
     }
 }

@@ -6,7 +6,7 @@
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::{Conditions, EvaluationSettings};
+use crate::evaluation::{EvaluationSettings, RandomizationLevel};
 use crate::pushes::Kick;
 
 /// Amplitudes of goals that reach farther than in training, and farther still.
@@ -24,7 +24,7 @@ const LIGHT_PUSH: f64 = 0.3;
 /// Time between pushes, seconds: a clip of 200 frames has two or three.
 const PUSH_INTERVAL: f64 = 1.5;
 
-/// Conditions with a name.
+/// RandomizationLevel with a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Condition {
@@ -108,7 +108,7 @@ impl Condition {
                 ..wide(WIDE)
             },
             Self::Randomized => EvaluationSettings {
-                conditions: Conditions::Full,
+                conditions: RandomizationLevel::Full,
                 ..wide(WIDE)
             },
         }

@@ -12,7 +12,7 @@ use emp_proto::v1::{
 use emp_robot::Robot;
 use emp_sim::{
     SimError,
-    evaluation::{Conditions, EpisodeResult, EvaluationSettings, Progress, evaluate},
+    evaluation::{EpisodeResult, EvaluationSettings, Progress, RandomizationLevel, evaluate},
     goals::{GoalClip, Source},
     pushes::Kick,
 };
@@ -217,8 +217,8 @@ async fn read_plan(
 
 fn read_settings(config: &EvaluateConfig, robot: &Robot) -> Result<EvaluationSettings, FieldError> {
     let conditions = match Randomization::try_from(config.randomization) {
-        Ok(Randomization::Unspecified | Randomization::Nominal) => Conditions::Nominal,
-        Ok(Randomization::Full) => Conditions::Full,
+        Ok(Randomization::Unspecified | Randomization::Nominal) => RandomizationLevel::Nominal,
+        Ok(Randomization::Full) => RandomizationLevel::Full,
         Err(_) => {
             let (field, number) = ("config.randomization", config.randomization);
             return Err(FieldError::not_in("Randomization", field, number));

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::end_reason::EndReason;
 use super::rewards::Outcome;
-use super::subject::{Conditions, Kind, Subject};
+use super::subject::{EpisodeSetup, Kind, Subject};
 use super::{EnvironmentConfig, REWARD_TERMS, Randomization};
 use crate::goals::{GoalLibrary, GoalStream};
 use crate::pushes::Pushes;
@@ -106,13 +106,13 @@ impl Environment {
             .library
             .stream(self.rng.next_u64(), setting.difficulty);
         self.next_goal(setting);
-        let conditions = Conditions {
+        let setup = EpisodeSetup {
             parameters,
             ranges,
             pushes: ranges.push.map(Pushes::Random),
         };
         self.subject
-            .place(&setting.kind, stage, conditions, &mut self.rng);
+            .place(&setting.kind, stage, setup, &mut self.rng);
         self.left = setting.config.episode_frames;
         self.age = 0;
         self.subject.observe();

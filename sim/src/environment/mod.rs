@@ -21,5 +21,5 @@ pub use privileged::PrivilegedLayout;
 pub(crate) use randomization::leg_targets;
 pub use randomization::{Hang, MassRange, Randomization};
 pub use rewards::{REWARD_NAMES, REWARD_TERMS, RewardWeights};
-pub(crate) use subject::{Conditions, Kind, Subject};
+pub(crate) use subject::{EpisodeSetup, Kind, Subject};
 pub use vec::{Step, VecEnvironment};

@@ -53,11 +53,42 @@ impl Kind {
     pub(crate) fn draw(&self, ranges: &Randomization, rng: &mut impl Rng) -> BodyParameters {
         ranges.draw(&self.robot, self.bodies, rng)
     }
+
+    /// A robot at rest, and its pushes to come: legs in their default pose, upper body at `goal` (rad), both as far off as the
+    /// ranges say, feet on the floor or above it.
+    pub(crate) fn begin(
+        &self,
+        stage: &mut Stage,
+        goal: &[f32],
+        setup: EpisodeSetup<'_>,
+        rng: &mut impl Rng,
+    ) -> (Body, PushClock) {
+        let ranges = setup.ranges;
+        let start = goal.iter().chain(&self.leg_default);
+        let joints: Vec<f64> = self
+            .robot
+            .joints()
+            .zip(start)
+            .map(|(joint, &angle)| {
+                let angle = f64::from(angle) + within(ranges.initial_joints, 0.0, rng);
+                angle.clamp(joint.range[0], joint.range[1])
+            })
+            .collect();
+        let hanging: f64 = rng.random();
+        let hang = ranges.hang.filter(|hang| hanging < hang.ratio);
+        let pushes = PushClock::new(setup.pushes, &self.robot, rng);
+        let body = stage.place(&Start {
+            joint_positions: &joints,
+            lift: hang.map_or(0.0, |hang| hang.height),
+            parameters: setup.parameters,
+        });
+        (body, pushes)
+    }
 }
 
-/// Under what an episode takes place.
+/// What an episode begins with.
 #[derive(Debug)]
-pub(crate) struct Conditions<'a> {
+pub(crate) struct EpisodeSetup<'a> {
     /// What was drawn for its body.
     pub(crate) parameters: BodyParameters,
     /// What its start and its action noise are drawn from.
@@ -107,35 +138,16 @@ impl Subject {
         }
     }
 
-    /// Starts an episode: legs in their default pose, upper body at the present goal, both as far off as the ranges say, feet
-    /// on the floor or above it.
+    /// Starts an episode with the upper body at the present goal, as [`Kind::begin`] says.
     pub(crate) fn place(
         &mut self,
         kind: &Kind,
         stage: &mut Stage,
-        conditions: Conditions<'_>,
+        setup: EpisodeSetup<'_>,
         rng: &mut impl Rng,
     ) {
-        let ranges = conditions.ranges;
-        let start = self.goal.iter().chain(&kind.leg_default);
-        let joints: Vec<f64> = kind
-            .robot
-            .joints()
-            .zip(start)
-            .map(|(joint, &angle)| {
-                let angle = f64::from(angle) + within(ranges.initial_joints, 0.0, rng);
-                angle.clamp(joint.range[0], joint.range[1])
-            })
-            .collect();
-        let hanging: f64 = rng.random();
-        let hang = ranges.hang.filter(|hang| hanging < hang.ratio);
-        self.pushes = PushClock::new(conditions.pushes, &kind.robot, rng);
-        self.action_noise = ranges.action;
-        self.body = stage.place(&Start {
-            joint_positions: &joints,
-            lift: hang.map_or(0.0, |hang| hang.height),
-            parameters: conditions.parameters,
-        });
+        self.action_noise = setup.ranges.action;
+        (self.body, self.pushes) = kind.begin(stage, &self.goal, setup, rng);
         kind.privileged.write_parameters(
             &kind.robot,
             self.body.parameters(),

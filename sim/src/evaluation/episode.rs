@@ -1,25 +1,23 @@
 //! One robot on one clip.
 
-use std::sync::Arc;
-
 use emp_models::controller::{ControllerInput, ControllerOutput, ControllerState};
 use emp_models::observation::RobotState;
-use emp_robot::Robot;
-use rand::{RngExt as _, SeedableRng as _};
+use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::observer::ExecutedFrame;
-use crate::environment::{EndReason, EnvironmentConfig, Randomization, leg_targets};
+use crate::environment::{
+    EndReason, EnvironmentConfig, EpisodeSetup, Kind, Randomization, leg_targets,
+};
 use crate::goals::{GoalClip, Source};
-use crate::metrics::{EpisodeSums, Frame};
+use crate::metrics::{EpisodeSums, Frame, Sample};
 use crate::pushes::{PushClock, Pushes};
-use crate::ranges::within;
-use crate::{Body, Stage, Start, Targets};
+use crate::{Body, Stage, Targets};
 
 /// What all episodes of an evaluation share.
 pub(super) struct Setting {
-    pub(super) robot: Arc<Robot>,
+    pub(super) kind: Kind,
     pub(super) seed: u64,
     pub(super) randomization: Randomization,
     pub(super) pushes: Option<Pushes>,
@@ -27,8 +25,6 @@ pub(super) struct Setting {
     pub(super) limits: EnvironmentConfig,
     /// The default pose of the goal joints, rad.
     pub(super) default: Vec<f32>,
-    /// Bodies of the model.
-    pub(super) bodies: usize,
 }
 
 /// How one episode went.
@@ -38,6 +34,8 @@ pub struct EpisodeResult {
     pub episode: usize,
     /// Name of its clip.
     pub clip: String,
+    /// The recording or procedural motion that the clip is a piece of.
+    pub motion: String,
     /// Where the clip's motion comes from.
     pub source: Source,
     /// Control periods that were executed, the last one included: that of the fall, or the clip's last.
@@ -46,6 +44,16 @@ pub struct EpisodeResult {
     pub failure: Option<EndReason>,
     /// What the frames add up to; a period in which the simulation diverged cannot be measured and is left out.
     pub sums: EpisodeSums,
+}
+
+impl EpisodeResult {
+    /// The episode as a sample of its motion.
+    pub fn sample(&self) -> Sample {
+        Sample {
+            motion: self.motion.clone(),
+            sums: self.sums,
+        }
+    }
 }
 
 /// An episode that is being run.
@@ -65,45 +73,32 @@ pub(super) struct Episode<'a> {
 }
 
 impl<'a> Episode<'a> {
-    /// The robot at rest: legs in their default pose, feet on the floor, upper body at the clip's first goal (under full
-    /// randomisation as in training: every joint a little off, now and then above the floor).
+    /// The robot at rest with its upper body at `start` (rad), as [`Kind::begin`] says.
     pub(super) fn new(
         setting: &Setting,
         number: usize,
         clip: &'a GoalClip,
+        start: &[f32],
         state: ControllerState,
         stage: &mut Stage,
     ) -> Self {
-        let robot = &setting.robot;
         let mut rng = ChaCha8Rng::seed_from_u64(setting.seed);
         rng.set_stream(number as u64);
         let ranges = &setting.randomization;
-        let parameters = ranges.draw(robot, setting.bodies, &mut rng);
-        let legs = robot.leg_joints().iter().map(|joint| joint.default);
-        let goal = clip.frame(0).iter().map(|&angle| f64::from(angle));
-        let start: Vec<f64> = goal
-            .chain(legs)
-            .zip(robot.joints())
-            .map(|(angle, joint)| {
-                let angle = angle + within(ranges.initial_joints, 0.0, &mut rng);
-                angle.clamp(joint.range[0], joint.range[1])
-            })
-            .collect();
-        let hanging: f64 = rng.random();
-        let hang = ranges.hang.filter(|hang| hanging < hang.ratio);
-        let pushes = PushClock::new(setting.pushes, robot, &mut rng);
+        let setup = EpisodeSetup {
+            parameters: setting.kind.draw(ranges, &mut rng),
+            ranges,
+            pushes: setting.pushes,
+        };
+        let (body, pushes) = setting.kind.begin(stage, start, setup, &mut rng);
         Self {
             number,
             clip,
-            body: stage.place(&Start {
-                joint_positions: &start,
-                lift: hang.map_or(0.0, |hang| hang.height),
-                parameters,
-            }),
+            body,
             pushes,
             rng,
             state,
-            legs: vec![0.0; robot.leg_joints().len()],
+            legs: vec![0.0; setting.kind.leg_default.len()],
             executed: 0,
             outcome: None,
             sums: EpisodeSums::default(),
@@ -135,10 +130,10 @@ impl<'a> Episode<'a> {
     /// One control period with the controller's answer.
     pub(super) fn step(&mut self, setting: &Setting, stage: &mut Stage, output: &ControllerOutput) {
         self.pushes
-            .tick(&setting.robot, &mut self.body, &mut self.rng);
+            .tick(&setting.kind.robot, &mut self.body, &mut self.rng);
         match setting.randomization.action {
             Some(noise) => leg_targets(
-                &setting.robot,
+                &setting.kind.robot,
                 &output.action,
                 Some(noise),
                 &mut self.rng,
@@ -154,9 +149,7 @@ impl<'a> Episode<'a> {
             legs: &self.legs,
         };
         let reading = stage.step(&mut self.body, &targets);
-        let fall = setting
-            .limits
-            .fall(reading, setting.robot.standing_height());
+        let fall = setting.limits.fall(reading, setting.kind.standing_height);
         if reading.divergence.is_none() {
             self.sums.add(&Frame {
                 reading,
@@ -190,6 +183,7 @@ impl<'a> Episode<'a> {
         Some(EpisodeResult {
             episode: self.number,
             clip: self.clip.name.clone(),
+            motion: self.clip.motion.clone(),
             source: self.clip.source,
             frames: self.executed,
             failure: self.outcome?,

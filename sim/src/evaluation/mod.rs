@@ -13,6 +13,7 @@ mod tests;
 
 use std::collections::HashMap;
 use std::ops::Range;
+use std::sync::Arc;
 
 use emp_models::controller::Controller;
 use rayon::prelude::*;
@@ -20,11 +21,11 @@ use serde::Serialize;
 
 pub use episode::EpisodeResult;
 pub use observer::{ExecutedFrame, Observer};
-pub use settings::{Conditions, EvaluationSettings};
+pub use settings::{EvaluationSettings, RandomizationLevel};
 
-use crate::environment::EnvironmentConfig;
+use crate::environment::{EnvironmentConfig, Kind};
 use crate::goals::{GoalClip, GoalStatistics, Source};
-use crate::metrics::{self, EpisodeSums, Interval, Metrics};
+use crate::metrics::{self, Interval, Metrics, Sample};
 use crate::{Pool, SimError};
 use episode::{Episode, Setting};
 
@@ -51,7 +52,7 @@ impl Progress for () {
 
 /// What an evaluation came to.
 ///
-/// As JSON it is one object: robot, controller, seed, settings, complete, episodes, each metric by its name as
+/// As JSON it is one object: robot, controller, seed, settings, complete, episodes, motions, each metric by its name as
 /// `{mean, low, high}`, goals, recorded, procedural, failures.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Evaluation {
@@ -84,7 +85,9 @@ pub struct Evaluation {
 pub struct Scores {
     /// Number of episodes.
     pub episodes: usize,
-    /// The metrics with their 95 % bootstrap intervals over the episodes.
+    /// Number of recordings and procedural motions that they play: what the intervals rest on.
+    pub motions: usize,
+    /// The metrics with their 95 % intervals.
     #[serde(flatten)]
     pub metrics: Metrics<Interval>,
     /// How hard the clips are: a success rate on easy motion says little. None where no clip has two frames.
@@ -107,7 +110,7 @@ pub struct Failure {
 }
 
 impl Evaluation {
-    /// The difference `self − other` of the metrics over the episodes that both finished, with intervals over pairs; none
+    /// The difference `self − other` of the metrics over the episodes that both finished, with intervals over motions; none
     /// where the two are not of the same robot, seed and clips, or have no episode in common.
     pub fn difference(&self, other: &Self) -> Option<Metrics<Interval>> {
         let [ours, theirs] = self.pairs(other)?;
@@ -122,7 +125,7 @@ impl Evaluation {
     }
 
     /// Episodes that both finished, ours and theirs in the same order.
-    fn pairs(&self, other: &Self) -> Option<[Vec<EpisodeSums>; 2]> {
+    fn pairs(&self, other: &Self) -> Option<[Vec<Sample>; 2]> {
         if (&self.robot, self.seed) != (&other.robot, other.seed) {
             return None;
         }
@@ -131,7 +134,7 @@ impl Evaluation {
             .iter()
             .map(|result| (result.episode, result))
             .collect();
-        let mut pairs: [Vec<EpisodeSums>; 2] = [Vec::new(), Vec::new()];
+        let mut pairs: [Vec<Sample>; 2] = [Vec::new(), Vec::new()];
         for ours in &self.results {
             let Some(theirs) = theirs.get(&ours.episode) else {
                 continue;
@@ -139,8 +142,8 @@ impl Evaluation {
             if theirs.clip != ours.clip {
                 return None;
             }
-            pairs[0].push(ours.sums);
-            pairs[1].push(theirs.sums);
+            pairs[0].push(ours.sample());
+            pairs[1].push(theirs.sample());
         }
         (!pairs[0].is_empty()).then_some(pairs)
     }
@@ -189,7 +192,7 @@ pub fn evaluate_observed(
         controller,
         clips: &clips,
         setting: Setting {
-            robot: robot.clone(),
+            kind: Kind::new(Arc::clone(robot)),
             seed: settings.seed,
             pushes: settings.pushes(&randomization),
             randomization,
@@ -199,7 +202,6 @@ pub fn evaluate_observed(
                 .iter()
                 .map(|joint| joint.default as f32)
                 .collect(),
-            bodies: robot.model().body_mass().len(),
         },
     };
     let episodes = settings.episodes.unwrap_or(clips.len());
@@ -267,7 +269,7 @@ impl<'a> Runner<'a> {
         if progress.is_cancelled() {
             return Ok(());
         }
-        let mut episodes = self.place(group);
+        let mut episodes = self.place(group)?;
         while !episodes.iter().all(Episode::is_over) && !progress.is_cancelled() {
             let mut batch: Vec<_> = episodes.iter_mut().map(Episode::input).collect();
             let mut outputs = self.controller.step(&mut batch)?;
@@ -295,32 +297,38 @@ impl<'a> Runner<'a> {
         Ok(())
     }
 
-    fn place(&self, group: Range<usize>) -> Vec<Episode<'a>> {
+    /// Places the robots of a group, each where its controller would have it before the clip begins: at its answer to the
+    /// clip's first goal. A served robot has followed its filter all along.
+    fn place(&self, group: Range<usize>) -> Result<Vec<Episode<'a>>, SimError> {
+        let first: Vec<&[f32]> = group.clone().map(|n| self.clip(n).frame(0)).collect();
+        let starts = self.controller.settled_goals(&first)?;
         let mut slots: Vec<Option<Episode<'a>>> = group.clone().map(|_| None).collect();
-        let places = slots.par_iter_mut().enumerate();
-        self.pool.for_each(places, |stage, (index, slot)| {
+        let places = slots.par_iter_mut().zip(&starts).enumerate();
+        self.pool.for_each(places, |stage, (index, (slot, start))| {
             let number = group.start + index;
             let (clip, state) = (self.clip(number), self.controller.state());
-            *slot = Some(Episode::new(&self.setting, number, clip, state, stage));
+            let setting = &self.setting;
+            *slot = Some(Episode::new(setting, number, clip, start, state, stage));
         });
-        slots.into_iter().flatten().collect()
+        Ok(slots.into_iter().flatten().collect())
     }
 
     /// Scores of the episodes on motion of `source`, or of all.
     fn scores(&self, results: &[EpisodeResult], source: Option<Source>) -> Scores {
         let is_of = |result: &&EpisodeResult| source.is_none_or(|source| source == result.source);
         let chosen: Vec<&EpisodeResult> = results.iter().filter(is_of).collect();
-        let sums: Vec<EpisodeSums> = chosen.iter().map(|result| result.sums).collect();
+        let samples: Vec<Sample> = chosen.iter().map(|result| result.sample()).collect();
         let clips = chosen.iter().map(|result| self.clip(result.episode));
         Scores {
             episodes: chosen.len(),
-            metrics: metrics::summary(&sums, self.setting.seed),
-            goals: GoalStatistics::of(&self.setting.robot, clips),
+            motions: metrics::motions(&samples),
+            metrics: metrics::summary(&samples, self.setting.seed),
+            goals: GoalStatistics::of(&self.setting.kind.robot, clips),
         }
     }
 
     fn failures(&self, results: &[EpisodeResult]) -> Vec<Failure> {
-        let rate = self.setting.robot.control_rate_hz();
+        let rate = self.setting.kind.robot.control_rate_hz();
         let failure = |result: &EpisodeResult| {
             Some(Failure {
                 episode: result.episode,

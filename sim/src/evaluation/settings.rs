@@ -10,7 +10,7 @@ use crate::pushes::{Kick, Pushes};
 /// How much the simulated robots differ from the model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Conditions {
+pub enum RandomizationLevel {
     /// The model as it is, but for the load in the hands.
     #[default]
     Nominal,
@@ -28,7 +28,7 @@ pub struct EvaluationSettings {
     /// Number of episodes, which take the clips in turn; none: one a clip.
     pub episodes: Option<usize>,
     /// How much the robots differ from the model.
-    pub conditions: Conditions,
+    pub conditions: RandomizationLevel,
     /// Mass added to each hand, drawn separately, kg. None: under nominal conditions the robot's test load, else as in
     /// training.
     pub hand_load: Option<[f64; 2]>,
@@ -45,7 +45,7 @@ impl Default for EvaluationSettings {
         Self {
             seed: 0,
             episodes: None,
-            conditions: Conditions::Nominal,
+            conditions: RandomizationLevel::Nominal,
             hand_load: None,
             push: None,
             speed: 1.0,
@@ -83,11 +83,11 @@ impl EvaluationSettings {
     /// What differs between episodes, but for the pushes.
     pub(super) fn randomization(&self, robot: &Robot) -> Randomization {
         let mut randomization = match self.conditions {
-            Conditions::Nominal => Randomization {
+            RandomizationLevel::Nominal => Randomization {
                 hand_mass: MassRange::Kilograms(robot.added_masses().test_hand),
                 ..Randomization::nominal()
             },
-            Conditions::Full => Randomization::default(),
+            RandomizationLevel::Full => Randomization::default(),
         };
         if let Some(load) = self.hand_load {
             randomization.hand_mass = MassRange::Kilograms(load);

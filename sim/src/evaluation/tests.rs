@@ -1,13 +1,15 @@
 use std::cell::Cell;
+use std::path::Path;
 use std::sync::Arc;
 
 use emp_models::controller::Controller;
+use emp_models::policy::Policy;
 use emp_robot::Robot;
 
 use super::*;
 use crate::Priority;
 use crate::pushes::Kick;
-use crate::testing::{emp27, goal_library, policy};
+use crate::testing::{emp27, goal_library, policy, pose};
 
 fn pool(robot: &Robot, threads: usize) -> Pool {
     Pool::new(robot, threads, Priority::Normal).unwrap()
@@ -64,7 +66,7 @@ fn the_same_request_gives_the_same_bits_on_any_number_of_threads() {
     for settings in [
         hard(),
         EvaluationSettings {
-            conditions: Conditions::Full,
+            conditions: RandomizationLevel::Full,
             episodes: Some(70),
             ..EvaluationSettings::default()
         },
@@ -193,6 +195,56 @@ fn tracking_is_judged_by_the_goal_that_was_asked_for() {
     assert_eq!(cut.difference(&run(&robot, 2, &other)), None);
 }
 
+/// The policy that ships.
+fn shipped(robot: &Arc<Robot>, filter: &str) -> Controller {
+    let weights = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../models/weights/emp27-policy.safetensors"
+    );
+    let policy = Policy::load(Path::new(weights), Arc::clone(robot)).unwrap();
+    Controller::by_name(filter, &Arc::new(policy), None).unwrap()
+}
+
+#[test]
+fn a_robot_starts_where_its_filter_has_it() {
+    let robot = emp27();
+    // Arms far from the default pose from the first frame on.
+    let swing = |number: usize| {
+        let goal = |t: usize| {
+            let swing = 0.4 * (0.06 * (t * (number + 1)) as f32).sin();
+            pose(&robot, &[("shoulder_pitch", swing - 1.2), ("elbow", 0.8)])
+        };
+        let rows: Vec<Vec<f32>> = (0..100).map(goal).collect();
+        GoalClip::new(&robot, format!("swing {number}"), Source::Procedural, &rows).unwrap()
+    };
+    let clips: Vec<GoalClip> = (0..4).map(swing).collect();
+    let mus = |filter: &str| {
+        let controller = shipped(&robot, filter);
+        let settings = EvaluationSettings::default();
+        let pool = pool(&robot, 2);
+        let evaluation = evaluate(&pool, &controller, &clips, &settings, &mut ()).unwrap();
+        assert_eq!(evaluation.all.metrics.suc.mean, 1.0);
+        evaluation.all.metrics.mus.mean
+    };
+    // 0.7 of the motion is 0.7² of its squared acceleration: no jump at the start adds to it.
+    let share = mus("amplitude-cut:factor=0.7") / mus("decoupled");
+    assert!((share - 0.49).abs() < 0.05, "{share}");
+}
+
+#[test]
+fn clips_of_one_recording_are_one_unit() {
+    let robot = emp27();
+    let library = goal_library(&robot);
+    let pieces = (0..3).flat_map(|seed| library.sample(seed, 1.0, 120).windows(40));
+    let clips: Vec<GoalClip> = pieces.collect();
+    let controller = controller(&robot, "decoupled");
+    let settings = EvaluationSettings::default();
+    let all = evaluate(&pool(&robot, 2), &controller, &clips, &settings, &mut ()).unwrap();
+    assert_eq!((all.all.episodes, all.all.motions), (9, 3));
+    assert_eq!(all.results[4].motion, all.results[3].motion);
+    assert_ne!(all.results[4].clip, all.results[3].clip);
+}
+
 /// Cancels once it was told of some episodes.
 struct Patience {
     left: Cell<usize>,
@@ -242,7 +294,7 @@ fn a_cancelled_evaluation_leaves_what_it_finished() {
 fn json_is_one_object_with_the_metrics_by_name() {
     let evaluation = run(&emp27(), 2, &hard());
     let json = serde_json::to_value(&evaluation).unwrap();
-    for name in Metrics::<Interval>::NAMES {
+    for metrics::Metric { name, .. } in metrics::LIST {
         for part in ["mean", "low", "high"] {
             assert!(json[name][part].is_f64(), "{name}: {}", json[name]);
             assert!(json["procedural"][name][part].is_f64());

@@ -22,6 +22,8 @@ pub enum Source {
 pub struct GoalClip {
     /// Where it comes from: a file's stem or a skill and its seed, with `@frame` where it is a window of a longer clip.
     pub name: String,
+    /// The recording or procedural motion that it is a piece of: pieces of one are not independent.
+    pub motion: String,
     /// Whether a person moved.
     pub source: Source,
     joints: usize,
@@ -61,12 +63,7 @@ impl GoalClip {
             }
             angles.extend(row);
         }
-        let mut clip = Self {
-            name,
-            source,
-            joints: joints.len(),
-            angles,
-        };
+        let mut clip = Self::from_angles(name, source, joints.len(), angles);
         clip.clamp(robot);
         Ok(clip)
     }
@@ -79,6 +76,7 @@ impl GoalClip {
         angles: Vec<f32>,
     ) -> Self {
         Self {
+            motion: name.clone(),
             name,
             source,
             joints,
@@ -194,8 +192,10 @@ impl GoalClip {
                 1 => self.name.clone(),
                 _ => format!("{}@{}", self.name, index * frames),
             },
+            motion: self.motion.clone(),
+            source: self.source,
+            joints: self.joints,
             angles: angles.to_vec(),
-            ..*self
         };
         pieces.enumerate().map(piece).collect()
     }

@@ -5,6 +5,7 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use super::GoalClip;
+use crate::quantile::quantile;
 
 /// Key nodes of the wrists, left and right: the last of [`emp_robot::KEY_NODE_NAMES`].
 const WRISTS: [usize; 2] = [6, 7];
@@ -73,7 +74,7 @@ impl Spread {
     fn of(mut values: Vec<f64>) -> Option<Self> {
         values.sort_by(f64::total_cmp);
         Some(Self {
-            p95: *values.get(values.len().saturating_sub(1) * 95 / 100)?,
+            p95: quantile(&values, 0.95)?,
             mean: values.iter().sum::<f64>() / values.len() as f64,
         })
     }

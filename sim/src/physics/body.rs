@@ -107,8 +107,9 @@ pub struct FootReading {
 /// Contacts between the links that may touch each other.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SelfContact {
-    /// Vector sum of the forces on each pair's first-named link, averaged over the control period, world frame, N.
-    pub force: Vector3<f64>,
+    /// How hard they press: the sum over touching pairs of the norm of the pair's contact force, averaged over the control
+    /// period, N.
+    pub force: f64,
     /// Whether a pair touched at any physics step of the control period.
     pub touched: bool,
 }

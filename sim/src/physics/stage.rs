@@ -245,22 +245,25 @@ impl Stage {
         bottoms.fold(f64::INFINITY, f64::min)
     }
 
-    /// Adds the self-contacts of the last physics step.
+    /// Adds the self-contacts of the last physics step. The contact points of one pair are one force; those of two pairs never
+    /// cancel.
     fn add_self_contact(&self, sum: &mut SelfContact) {
+        let mut pairs: Vec<([i32; 2], Vector3<f64>)> = Vec::new();
         for (id, contact) in self.data.contact().iter().enumerate() {
-            let Some(first) = self.rig.pairs.touching(contact) else {
+            let Some(pair) = self.rig.pairs.touching(contact) else {
                 continue;
             };
             let [x, y, z, ..] = self.data.contact_force(id);
             // Rows of the frame are the contact's axes; the force is what the first geom does to the second.
             let force = Matrix3::from_row_slice(&contact.frame).transpose() * Vector3::new(x, y, z);
-            sum.force += if contact.geom[1] == first {
-                force
-            } else {
-                -force
-            };
-            sum.touched = true;
+            let on_second = if contact.geom == pair { force } else { -force };
+            match pairs.iter_mut().find(|(known, _)| *known == pair) {
+                Some((_, sum)) => *sum += on_second,
+                None => pairs.push((pair, on_second)),
+            }
         }
+        sum.force += pairs.iter().map(|(_, force)| force.norm()).sum::<f64>();
+        sum.touched |= !pairs.is_empty();
     }
 
     /// Measures the body on the stage, whose state still is that of before the control period.

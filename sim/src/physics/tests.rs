@@ -104,7 +104,7 @@ fn a_body_at_rest_stands_on_both_feet() {
         assert!(offset.xy().norm() < 0.08, "{offset}");
         assert!((0.3..1.2).contains(&offset.z), "{offset}");
         assert!(!reading.self_contact.touched);
-        assert_eq!(reading.self_contact.force, Vector3::zeros());
+        assert_eq!(reading.self_contact.force, 0.0);
         assert_eq!(reading.divergence, None);
     });
 }
@@ -402,9 +402,8 @@ fn a_hand_on_the_body_is_pushed_off() {
         let mut stage = Stage::new(robot).unwrap();
         let mut body = place(robot, &mut stage, BodyParameters::default());
         let mut contacts = (0..25).map(|_| stage.step(&mut body, &targets).self_contact.clone());
-        // Pairs name hands first; the body pushes the left one to the left.
         let contact = contacts.find(|contact| contact.touched).unwrap();
-        assert!(contact.force.y > 1.0, "{}: {contact:?}", robot.name());
+        assert!(contact.force > 1.0, "{}: {contact:?}", robot.name());
     });
 }
 

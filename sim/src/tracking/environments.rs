@@ -40,7 +40,7 @@ pub struct TrackingStep<'a> {
     /// Horizontal way from the middle between the feet to the measured centre of mass, heading frame (x forward, y left),
     /// N × 2, metres.
     pub com: &'a [f32],
-    /// Contact force of the robot with itself, averaged over the control period, N, newtons.
+    /// Contact force of the robot with itself ([`SelfContact::force`](crate::SelfContact::force)), N, newtons.
     pub contact: &'a [f32],
     /// How the control period ended, N. Where it ended an episode, the observations are already those of the next one.
     pub ends: &'a [End],

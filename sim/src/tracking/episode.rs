@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::TrackingSettings;
-use crate::environment::{Conditions, EndReason, EnvironmentConfig, Kind, Randomization, Subject};
+use crate::environment::{EndReason, EnvironmentConfig, EpisodeSetup, Kind, Randomization, Subject};
 use crate::goals::{GoalClip, GoalJoint, Piece};
 use crate::pushes::{Kick, Pushes};
 use crate::ranges::within;
@@ -133,9 +133,9 @@ impl Environment {
         self.piece = draw_piece(setting, &mut self.rng);
         (self.age, self.length) = (0, self.piece.frames);
         self.set_goals(setting);
-        let conditions = draw_conditions(setting, &mut self.rng);
+        let setup = draw_setup(setting, &mut self.rng);
         self.subject
-            .place(&setting.kind, stage, conditions, &mut self.rng);
+            .place(&setting.kind, stage, setup, &mut self.rng);
         self.subject.observe();
     }
 
@@ -199,7 +199,7 @@ impl Environment {
         orientation.copy_from_slice(&newest[layout.orientation()]);
         let com = reading.center_of_mass_over_feet();
         slots.com.copy_from_slice(&[com.x as f32, com.y as f32]);
-        *slots.contact = reading.self_contact.force.norm() as f32;
+        *slots.contact = reading.self_contact.force as f32;
     }
 
     /// Writes what the learner sees now.
@@ -231,7 +231,7 @@ fn draw_piece(setting: &Setting, rng: &mut ChaCha8Rng) -> Piece {
     }
 }
 
-fn draw_conditions<'a>(setting: &'a Setting, rng: &mut ChaCha8Rng) -> Conditions<'a> {
+fn draw_setup<'a>(setting: &'a Setting, rng: &mut ChaCha8Rng) -> EpisodeSetup<'a> {
     let settings = &setting.settings;
     let is_randomized = rng.random::<f64>() < settings.randomized;
     let is_pushed = rng.random::<f64>() < settings.pushed;
@@ -244,7 +244,7 @@ fn draw_conditions<'a>(setting: &'a Setting, rng: &mut ChaCha8Rng) -> Conditions
         speed: within(Some(settings.push_speed), 0.0, rng),
         interval: settings.push_interval,
     };
-    Conditions {
+    EpisodeSetup {
         parameters: setting.kind.draw(ranges, rng),
         ranges,
         pushes: if is_pushed {

@@ -31,6 +31,12 @@ pub enum FilterError {
         /// What could stand there.
         expected: String,
     },
+    /// Only filters that need no learning combine.
+    #[error("filter {filter} cannot be combined with others by `>`")]
+    Combined {
+        /// Name of the filter.
+        filter: String,
+    },
     /// The robot has no EMP.
     #[error("filter {filter}: robot {robot} has no EMP weights")]
     NoEmp {

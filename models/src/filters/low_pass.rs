@@ -28,7 +28,7 @@ impl LowPass {
         let rate = robot.control_rate_hz();
         let cutoff = parameters.number("cutoff", 0.01..=0.5 * rate, " Hz")?;
         let order = parameters.word("order", &["1", "2"])?;
-        parameters.finish("cutoff or order")?;
+        parameters.finish("cutoff, order or joints")?;
         let order = if order == Some("2") { 2 } else { 1 };
         let section = cutoff.unwrap_or(2.0) / (2.0_f64.powf(1.0 / order as f64) - 1.0).sqrt();
         Ok(Self {
@@ -40,8 +40,12 @@ impl LowPass {
 }
 
 impl Rule for LowPass {
+    fn memory(&self) -> usize {
+        self.order * self.joints
+    }
+
     fn apply(&self, item: &mut FilterItem<'_>) {
-        let Some(memory) = remembered(item.memory, self.order * self.joints) else {
+        let Some(memory) = remembered(item.memory, self.memory()) else {
             item.memory.clear();
             let sections = |&goal: &f32| std::iter::repeat_n(goal, self.order);
             item.memory.extend(item.goal.iter().flat_map(sections));

@@ -43,22 +43,22 @@ pub const LIST: [FilterDescription; 9] = [
     },
     FilterDescription {
         name: VELOCITY_LIMIT,
-        parameters: "limit=<each joint's own>",
+        parameters: "limit=<each joint's own>,joints=<all>",
         summary: "no joint's goal moves faster than limit (rad/s)",
     },
     FilterDescription {
         name: ONE_EURO,
-        parameters: "cutoff=2,beta=0.5,derivative=1",
+        parameters: "cutoff=2,beta=0.5,derivative=1,joints=<all>",
         summary: "low-pass at cutoff (Hz) that opens by beta (Hz per rad/s) as a joint speeds up; derivative (Hz) smooths that speed",
     },
     FilterDescription {
         name: AMPLITUDE_CUT,
-        parameters: "factor=0.9",
+        parameters: "factor=0.9,joints=<all>",
         summary: "every goal's distance from the default pose times factor (0 to 1)",
     },
     FilterDescription {
         name: LOW_PASS,
-        parameters: "cutoff=2,order=1",
+        parameters: "cutoff=2,order=1,joints=<all>",
         summary: "low-pass at cutoff (Hz, half power), order equal first-order sections in a row, no overshoot",
     },
     FilterDescription {

@@ -28,7 +28,7 @@ impl OneEuro {
         let cutoff = parameters.number("cutoff", 0.01..=1000.0, " Hz")?;
         let beta = parameters.number("beta", 0.0..=1000.0, " Hz per rad/s")?;
         let derivative = parameters.number("derivative", 0.01..=1000.0, " Hz")?;
-        parameters.finish("cutoff, beta or derivative")?;
+        parameters.finish("cutoff, beta, derivative or joints")?;
         Ok(Self {
             cutoff: cutoff.unwrap_or(2.0),
             beta: beta.unwrap_or(0.5),
@@ -46,8 +46,12 @@ impl OneEuro {
 }
 
 impl Rule for OneEuro {
+    fn memory(&self) -> usize {
+        3 * self.joints
+    }
+
     fn apply(&self, item: &mut FilterItem<'_>) {
-        let Some(memory) = remembered(item.memory, 3 * self.joints) else {
+        let Some(memory) = remembered(item.memory, self.memory()) else {
             item.memory.clear();
             let fresh = item.goal.iter().flat_map(|&goal| [goal, goal, 0.0]);
             item.memory.extend(fresh);

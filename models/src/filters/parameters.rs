@@ -2,6 +2,8 @@
 
 use std::{collections::BTreeMap, ops::RangeInclusive};
 
+use emp_robot::Robot;
+
 use super::error::FilterError;
 
 /// A filter's name, and the parameters that nobody has asked for yet.
@@ -61,6 +63,25 @@ impl<'a> Parameters<'a> {
         let word = words.iter().find(|word| **word == text);
         word.map(|word| Some(*word))
             .ok_or_else(|| self.value(key, words.join(" or "), text))
+    }
+
+    /// Indices of the goal joints that `joints` does not name, as in `joints=waist+shoulder`: words in the names of those that
+    /// it is for; none if it is not given.
+    pub(super) fn other_joints(&mut self, robot: &Robot) -> Result<Vec<usize>, FilterError> {
+        let Some(text) = self.given.remove("joints") else {
+            return Ok(Vec::new());
+        };
+        let joints = robot.goal_joints();
+        let words: Vec<&str> = text.split('+').map(str::trim).collect();
+        let is_any = |word: &&str| joints.iter().any(|joint| joint.name.contains(*word));
+        if let Some(word) = words.iter().find(|word| word.is_empty() || !is_any(word)) {
+            let expected = "parts of goal joints' names, joined by +";
+            return Err(self.value("joints", expected, *word));
+        }
+        let is_other = |name: &str| !words.iter().any(|word| name.contains(word));
+        let joints = joints.iter().enumerate();
+        let others = joints.filter(|(_, joint)| is_other(&joint.name));
+        Ok(others.map(|(index, _)| index).collect())
     }
 
     /// All that is left.

@@ -7,26 +7,79 @@ use crate::ModelError;
 
 /// Changes one robot's goal by a fixed rule.
 pub(super) trait Rule: Send + Sync {
+    /// Numbers that it remembers of a robot.
+    fn memory(&self) -> usize {
+        0
+    }
+
     fn apply(&self, item: &mut FilterItem<'_>);
 }
 
-/// A rule as a filter.
+/// A rule for some joints alone.
+pub(super) struct SomeJoints {
+    rule: Box<dyn Rule>,
+    /// Indices of the goal joints that it leaves alone.
+    others: Vec<usize>,
+}
+
+impl SomeJoints {
+    /// `rule` for all goal joints but `others`.
+    pub(super) fn new(rule: Box<dyn Rule>, others: Vec<usize>) -> Self {
+        Self { rule, others }
+    }
+}
+
+impl Rule for SomeJoints {
+    fn memory(&self) -> usize {
+        self.rule.memory()
+    }
+
+    fn apply(&self, item: &mut FilterItem<'_>) {
+        let asked: Vec<f32> = self.others.iter().map(|&joint| item.goal[joint]).collect();
+        self.rule.apply(item);
+        for (&joint, asked) in self.others.iter().zip(asked) {
+            item.goal[joint] = asked;
+        }
+    }
+}
+
+/// Rules as a filter, one after the other.
 pub(super) struct RuleFilter {
     specification: String,
-    rule: Box<dyn Rule>,
+    rules: Vec<Box<dyn Rule>>,
     ranges: Vec<[f32; 2]>,
 }
 
 impl RuleFilter {
-    /// `rule` for `robot`, as `specification` asks for it.
-    pub(super) fn new(specification: &str, rule: Box<dyn Rule>, robot: &Robot) -> Self {
+    /// `rules` for `robot`, as `specification` asks for them.
+    pub(super) fn new(specification: &str, rules: Vec<Box<dyn Rule>>, robot: &Robot) -> Self {
         let ranges = robot.goal_joints().iter();
         Self {
             specification: specification.trim().to_owned(),
-            rule,
+            rules,
             ranges: ranges
                 .map(|joint| joint.range.map(|limit| limit as f32))
                 .collect(),
+        }
+    }
+
+    /// Applies the rules to one robot's goal; what they remember stands one after the other.
+    fn apply(&self, item: &mut FilterItem<'_>) {
+        let memories: usize = self.rules.iter().map(|rule| rule.memory()).sum();
+        let is_known = item.memory.len() == memories;
+        let mut known = std::mem::take(item.memory).into_iter();
+        for rule in &self.rules {
+            let mut memory = Vec::new();
+            if is_known {
+                memory.extend(known.by_ref().take(rule.memory()));
+            }
+            rule.apply(&mut FilterItem {
+                observation: item.observation,
+                goal: item.goal,
+                memory: &mut memory,
+                risk: item.risk,
+            });
+            item.memory.extend(memory);
         }
     }
 }
@@ -38,7 +91,7 @@ impl GoalFilter for RuleFilter {
 
     fn filter(&self, batch: &mut [FilterItem<'_>]) -> Result<(), ModelError> {
         for item in batch {
-            self.rule.apply(item);
+            self.apply(item);
             for (angle, range) in item.goal.iter_mut().zip(&self.ranges) {
                 *angle = angle.clamp(range[0], range[1]);
             }

@@ -188,9 +188,11 @@ fn every_filter_of_the_list_has_its_defaults() {
             let by_default = filter(&robot, name);
             assert_eq!(by_default.name(), name);
             // A parameter in angle brackets has no one number.
-            let specification = match parameters.contains('<') {
+            let numbers = parameters.split(',').filter(|part| !part.contains('<'));
+            let numbers: Vec<&str> = numbers.collect();
+            let specification = match numbers.is_empty() {
                 true => name.to_owned(),
-                false => format!("{name}:{parameters}"),
+                false => format!("{name}:{}", numbers.join(",")),
             };
             let spelled_out = filter(&robot, &specification);
             assert_eq!(spelled_out.name(), specification);
@@ -471,5 +473,72 @@ fn mistakes_in_a_specification_are_named() {
         for word in words {
             assert!(message.contains(word), "{specification}: {message}");
         }
+    }
+}
+
+#[test]
+fn a_filter_by_joint_can_be_for_some_of_them() {
+    for robot in robots() {
+        let goals = step(&robot, 12);
+        for filter in [
+            "velocity-limit:limit=1",
+            "low-pass:cutoff=1",
+            "one-euro",
+            "amplitude-cut",
+        ] {
+            let joined = if filter.contains(':') { ',' } else { ':' };
+            let some = format!("{filter}{joined}joints=waist+shoulder_roll");
+            let all = run(&*self::filter(&robot, filter), &robot, &goals);
+            let some = run(&*self::filter(&robot, &some), &robot, &goals);
+            for (t, goal) in goals.iter().enumerate() {
+                for (j, joint) in robot.goal_joints().iter().enumerate() {
+                    let is_meant =
+                        joint.name.contains("waist") || joint.name.contains("shoulder_roll");
+                    let expected = if is_meant { all[t][j] } else { goal[j] };
+                    assert_eq!(some[t][j], expected, "{filter}: {} at {t}", joint.name);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn combined_filters_answer_one_after_the_other() {
+    for robot in robots() {
+        let goals = step(&robot, 20);
+        let parts = [
+            "amplitude-cut:factor=0.5",
+            "low-pass:cutoff=2,order=2",
+            "velocity-limit:limit=1,joints=shoulder",
+        ];
+        let mut expected = goals.clone();
+        for part in parts {
+            expected = run(&*filter(&robot, part), &robot, &expected);
+        }
+        let chain = filter(&robot, &parts.join(">"));
+        assert_eq!(run(&*chain, &robot, &goals), expected);
+        assert_eq!(chain.name(), parts.join(">"));
+        assert_ne!(expected, run(&*filter(&robot, parts[0]), &robot, &goals));
+    }
+}
+
+#[test]
+fn joints_and_combinations_that_are_none_are_refused() {
+    for (specification, part) in [
+        ("velocity-limit:joints=tail", "found tail"),
+        ("velocity-limit:joints=", "joined by +"),
+        ("velocity-limit:joints=waist+", "joined by +"),
+        ("static-clamp:joints=waist", "no parameter \"joints\""),
+        ("amplitude-cut>emp", "filter emp cannot be combined"),
+        (
+            "decoupled>amplitude-cut",
+            "filter decoupled cannot be combined",
+        ),
+        ("amplitude-cut>", "no filter \"\""),
+        ("amplitude-cut>nothing", "no filter \"nothing\""),
+        ("amplitude-cut:factor=2>low-pass", "factor"),
+    ] {
+        let error = refused(specification);
+        assert!(error.contains(part), "{specification}: {error}");
     }
 }

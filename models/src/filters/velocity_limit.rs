@@ -20,7 +20,7 @@ pub(super) struct VelocityLimit {
 impl VelocityLimit {
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let limit = parameters.number("limit", 0.01..=1000.0, " rad/s")?;
-        parameters.finish("limit")?;
+        parameters.finish("limit or joints")?;
         let joints = robot.goal_joints().iter();
         let step = |speed: f64| (speed / robot.control_rate_hz()) as f32;
         Ok(Self {
@@ -32,6 +32,10 @@ impl VelocityLimit {
 }
 
 impl Rule for VelocityLimit {
+    fn memory(&self) -> usize {
+        self.steps.len()
+    }
+
     fn apply(&self, item: &mut FilterItem<'_>) {
         if let Some(last) = remembered(item.memory, self.steps.len()) {
             for ((goal, last), step) in item.goal.iter_mut().zip(last).zip(&self.steps) {

@@ -10,5 +10,6 @@ pub mod policy;
 pub mod retargeter;
 mod rows;
 pub mod run;
+pub mod sets;
 pub mod variables;
 pub mod world_model;

@@ -12,6 +12,7 @@ use std::{
 
 use anyhow::{Context as _, Result};
 use indicatif::{ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
 
 /// Set by Ctrl-C or SIGTERM: the trainer saves and stops at the next step.
 #[derive(Clone, Default)]
@@ -100,6 +101,55 @@ pub fn spinner() -> ProgressBar {
     bar
 }
 
+/// A part of a run: from a start or a resumption to the next.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Session {
+    /// Steps that were done when it began.
+    pub from_step: u64,
+    /// The command.
+    pub command: String,
+    /// The revision that ran it, with `+` where files were changed.
+    pub git_revision: String,
+}
+
+impl Session {
+    /// The one that begins now.
+    pub fn begin(from_step: u64) -> Self {
+        Self {
+            from_step,
+            command: command_line(),
+            git_revision: git_revision(),
+        }
+    }
+}
+
+/// The command that this program was started by. Paths outside the working folder are given by their last part: metadata must
+/// not name the machine's folders.
+pub fn command_line() -> String {
+    let here = std::env::current_dir().unwrap_or_default();
+    let arguments = std::env::args_os().enumerate();
+    let arguments = arguments.map(|(index, argument)| match index {
+        0 => base_name(Path::new(&argument)),
+        _ => without_folders(&argument.to_string_lossy(), &here),
+    });
+    arguments.collect::<Vec<_>>().join(" ")
+}
+
+/// An argument as [`command_line`] has it, quoted where a shell needs it.
+fn without_folders(argument: &str, here: &Path) -> String {
+    let path = Path::new(argument);
+    let argument = match path.strip_prefix(here) {
+        Ok(inside) => inside.to_string_lossy().into_owned(),
+        Err(_) if path.is_absolute() => base_name(path),
+        Err(_) => argument.to_owned(),
+    };
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_=./:,+".contains(c);
+    if !argument.is_empty() && argument.chars().all(is_plain) {
+        return argument;
+    }
+    format!("'{}'", argument.replace('\'', r"'\''"))
+}
+
 /// The revision of the checkout that the program runs in, with `+` where files are changed; `unknown` outside one.
 pub fn git_revision() -> String {
     let git = |arguments: &[&str]| {
@@ -126,4 +176,28 @@ pub fn base_name(path: &Path) -> String {
         .unwrap_or(path.as_os_str())
         .to_string_lossy()
         .into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_names_no_folder_of_the_machine() {
+        let shown = |argument: &str| without_folders(argument, Path::new("/home/someone/emp"));
+        for (argument, expected) in [
+            ("--motions", "--motions"),
+            ("/data/of/someone/train", "train"),
+            ("/home/someone/emp/runs/a", "runs/a"),
+            ("runs/a", "runs/a"),
+            ("hindsight.weight=50", "hindsight.weight=50"),
+            ("two words", "'two words'"),
+            ("amplitude-cut>low-pass", "'amplitude-cut>low-pass'"),
+            ("it's", r"'it'\''s'"),
+            ("", "''"),
+        ] {
+            assert_eq!(shown(argument), expected, "{argument}");
+        }
+        assert!(!command_line().contains('/') || !command_line().starts_with('/'));
+    }
 }

@@ -19,7 +19,7 @@ pub(crate) struct Arguments {
     /// Print the settings as JSON and stop.
     #[arg(long)]
     print_settings: bool,
-    /// Where the weights go, f16 safetensors; written at every evaluation [default: best.safetensors in the run's folder].
+    /// Where the best weights go at the end, f16 safetensors [default: they stay best.safetensors in the run's folder].
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Folder of the run's checkpoint and logs [default: runs/emp-ROBOT].

@@ -103,15 +103,15 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     let candidates = arguments.candidates(&robot)?;
     let families = arguments.families();
     let gates = arguments.gates()?;
-    let clips = arguments.trial.clips(&robot)?;
+    let groups = arguments.trial.groups(&robot)?;
     let pool = arguments.trial.pool(&robot)?;
     linear::set_threads(arguments.trial.threads);
     let mut progress = EpisodeProgress::listen()?;
     let run = EmpRun {
         pool: &pool,
         policy: &policy,
-        clips: &clips,
-        seed: arguments.trial.seed,
+        groups: &groups,
+        set: arguments.trial.set,
         candidates: &candidates,
         families: &families,
         gates,

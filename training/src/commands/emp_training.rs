@@ -33,7 +33,7 @@ pub(super) struct TrainingArguments {
     /// Settings to start from.
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,
-    /// Change one setting, as in `risk.weight=50` or `losses.smooth_on=target`; `emp-train emp --print-settings` shows all.
+    /// Change one setting, as in `hindsight.weight=50` or `losses.smooth_on=target`; `emp-train emp --print-settings` shows all.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     changes: Vec<String>,
     /// Seed of weights, episodes and procedural skills.

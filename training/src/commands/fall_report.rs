@@ -6,7 +6,10 @@ use anyhow::Result;
 use clap::Args;
 use emp_models::emp::Emp;
 use emp_sim::suite::Condition;
-use emp_training::emp::falls::{self, FallRun};
+use emp_training::{
+    emp::falls::{self, FallRun},
+    sets::Basis,
+};
 
 use super::{
     arguments::RobotArguments,
@@ -38,7 +41,9 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     let emp = arguments.emp.as_ref();
     let emp = emp.map(|weights| Emp::load(weights, Arc::clone(&robot)));
     let emp = emp.transpose()?.map(Arc::new);
-    let clips = arguments.trial.clips(&robot)?;
+    let groups = arguments.trial.groups(&robot)?;
+    let basis = Basis::new(arguments.trial.set, &groups);
+    let clips: Vec<_> = groups.into_iter().flat_map(|group| group.clips).collect();
     let pool = arguments.trial.pool(&robot)?;
     let mut progress = EpisodeProgress::listen()?;
     let run = FallRun {
@@ -46,8 +51,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         policy: &policy,
         emp,
         clips: &clips,
+        basis: &basis,
         conditions: &Condition::HARD,
-        seed: arguments.trial.seed,
         cuts: !arguments.no_cuts,
     };
     let report = falls::report(&run, &mut progress)?;

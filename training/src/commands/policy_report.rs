@@ -40,12 +40,14 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         .iter()
         .map(|name| Controller::by_name(name, &policy, None));
     let controllers = controllers.collect::<Result<Vec<_>, _>>()?;
-    let clips = arguments.trial.clips(&robot)?;
+    let set = arguments.trial.set;
+    let groups = arguments.trial.groups(&robot)?;
     let pool = arguments.trial.pool(&robot)?;
-    let seed = arguments.trial.seed;
     let mut progress = EpisodeProgress::listen()?;
     let text = match &arguments.ladder {
         Some(folder) => {
+            let clips: Vec<_> = groups.into_iter().flat_map(|group| group.clips).collect();
+            let seed = set.seed();
             let ladder = report::ladder(&pool, &controllers, &clips, seed, &mut progress)?;
             let csv = folder.join("ladder.csv");
             atomic::write(&csv, ladder.csv().as_bytes())
@@ -54,7 +56,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
             printed(&ladder, arguments.json)?
         }
         None => {
-            let report = report::report(&pool, &controllers, &clips, seed, &mut progress)?;
+            let report = report::report(&pool, &controllers, &groups, set, &mut progress)?;
             printed(&report, arguments.json)?
         }
     };

@@ -1,10 +1,11 @@
-//! What every report on controllers takes: a policy, motion, a seed.
+//! What every report on controllers takes: a policy, and motion of one set.
 
-use std::{path::PathBuf, sync::Arc};
+use std::{collections::HashMap, path::PathBuf, sync::Arc};
 
 use anyhow::Result;
 use clap::Args;
 use emp_models::{policy::Policy, retarget::Retargeter};
+use emp_motion::{Clip, KeyNode};
 use emp_robot::Robot;
 use emp_sim::{
     Pool, Priority,
@@ -15,40 +16,33 @@ use emp_training::{
     policy::report,
     retargeter::data,
     run::{self, Interrupt},
+    sets::{ClipGroup, MotionSet},
 };
 
 use super::arguments::{policy_weights, retargeter_weights};
 
-/// Training draws its skills from other seeds.
-const PROCEDURAL_SEED: u64 = 0x7265_706f_7274;
+/// Mean speed of the faster hand below which a recording is slow, m/s.
+const SLOW: f64 = 0.2;
 
 /// Whom to try, and on what.
 #[derive(Args)]
 pub(crate) struct TrialArguments {
-    /// Folders (or files) of recorded motion; without any, procedural skills alone.
+    /// Folders (or files) of recorded motion of the set; without any, procedural motion alone.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     motions: Vec<PathBuf>,
-    /// Procedural motions, cut into clips like the recorded ones.
+    /// Procedural motions of the set, cut into clips like the recorded ones.
     #[arg(long, default_value_t = 100)]
     procedural: usize,
-    /// Seed of the procedural motions: the usual one is no training's.
-    #[arg(long, default_value_t = PROCEDURAL_SEED)]
-    procedural_seed: u64,
-    /// Play at most so many of the clips, evenly spread over them.
-    #[arg(long, default_value_t = 320)]
-    clips: usize,
-    /// Play a quarter of that number.
-    #[arg(long)]
-    quick: bool,
+    /// What the motion is for; it decides the seed of procedural motion, loads, pushes and randomisation too. `final` is for
+    /// tables of results alone: choose nothing by it.
+    #[arg(long, value_enum, default_value_t = MotionSet::Development)]
+    pub(crate) set: MotionSet,
     /// The policy [default: models/weights/ROBOT-policy.safetensors].
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
     /// Weights of the retargeter [default: models/weights/ROBOT-retargeter.safetensors].
     #[arg(long, value_name = "FILE")]
     retargeter: Option<PathBuf>,
-    /// Seed of loads, pushes and randomisation.
-    #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
     /// Threads for physics; the figures do not depend on it.
     #[arg(long, default_value_t = 2)]
     pub(crate) threads: usize,
@@ -64,35 +58,70 @@ impl TrialArguments {
         Ok(Arc::new(Policy::load(&weights, Arc::clone(robot))?))
     }
 
-    /// The clips: none of them was trained on, if --motions are other people's than in training.
-    pub(crate) fn clips(&self, robot: &Arc<Robot>) -> Result<Vec<GoalClip>> {
+    /// The clips by the kind of their motion, kinds without any left out.
+    pub(crate) fn groups(&self, robot: &Arc<Robot>) -> Result<Vec<ClipGroup>> {
         let weights = retargeter_weights(self.retargeter.as_ref(), robot);
         let retargeter = Retargeter::load(&weights, Arc::clone(robot))?;
+        self.set.check(&self.motions)?;
         let recorded = if self.motions.is_empty() {
             Vec::new()
         } else {
-            data::load_clips(&self.motions)?
+            with_names_of_their_own(data::load_clips(&self.motions)?)
         };
-        let skills = emp_motion::skills::library(self.procedural_seed, self.procedural);
-        let mut windows = Vec::new();
-        for (motion, source) in [(recorded, Source::Recorded), (skills, Source::Procedural)] {
+        let (slow, lively) = recorded
+            .into_iter()
+            .partition(|clip| hand_speed(clip) < SLOW);
+        let skills = emp_motion::skills::library(self.set.seed(), self.procedural);
+        let mut groups = Vec::new();
+        for (name, motion, source) in [
+            (ClipGroup::SLOW, slow, Source::Recorded),
+            (ClipGroup::LIVELY, lively, Source::Recorded),
+            (ClipGroup::PROCEDURAL, skills, Source::Procedural),
+        ] {
+            let motion: Vec<Clip> = motion;
             let clips = GoalClip::retargeted(&retargeter, &motion, source, self.threads)?;
-            windows.extend(clips.iter().flat_map(|clip| clip.windows(report::FRAMES)));
+            let clips = clips.iter().flat_map(|clip| clip.windows(report::FRAMES));
+            let clips: Vec<GoalClip> = clips.collect();
+            if !clips.is_empty() {
+                groups.push(ClipGroup { name, clips });
+            }
         }
-        let most = if self.quick {
-            self.clips / 4
-        } else {
-            self.clips
-        };
-        Ok(spread(&windows, most))
+        Ok(groups)
+    }
+
+    /// The clips of all kinds.
+    pub(crate) fn clips(&self, robot: &Arc<Robot>) -> Result<Vec<GoalClip>> {
+        let groups = self.groups(robot)?.into_iter();
+        Ok(groups.flat_map(|group| group.clips).collect())
     }
 }
 
-/// At most `most` of the clips, at even distances.
-fn spread(clips: &[GoalClip], most: usize) -> Vec<GoalClip> {
-    let count = most.min(clips.len());
-    let chosen = (0..count).map(|i| clips[i * clips.len() / count].clone());
-    chosen.collect()
+/// Numbers recordings of the same name in different folders, which are not the same motion.
+fn with_names_of_their_own(mut clips: Vec<Clip>) -> Vec<Clip> {
+    let mut seen: HashMap<String, usize> = HashMap::new();
+    for clip in &mut clips {
+        let count = seen.entry(clip.name.clone()).or_default();
+        *count += 1;
+        if *count > 1 {
+            clip.name += &format!(" ({count})");
+        }
+    }
+    clips
+}
+
+/// Mean speed of the faster hand relative to the waist, m/s.
+fn hand_speed(clip: &Clip) -> f64 {
+    let hands = clip.frames.iter().map(|frame| {
+        let waist = frame.position(KeyNode::Waist);
+        [KeyNode::LeftWrist, KeyNode::RightWrist].map(|wrist| frame.position(wrist) - waist)
+    });
+    let hands: Vec<_> = hands.collect();
+    let faster = hands.windows(2).map(|pair| {
+        let moved = [0, 1].map(|hand| (pair[1][hand] - pair[0][hand]).norm());
+        moved[0].max(moved[1])
+    });
+    let way: f64 = faster.map(f64::from).sum();
+    clip.fps * way / hands.len().saturating_sub(1).max(1) as f64
 }
 
 /// A report as it is printed.
@@ -135,5 +164,28 @@ impl Progress for EpisodeProgress {
 
     fn is_cancelled(&self) -> bool {
         self.interrupt.requested()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use emp_motion::skills::{Skill, generate};
+
+    use super::*;
+
+    #[test]
+    fn recordings_of_one_name_stay_two() {
+        let clips = vec![generate(Skill::Wave, 1); 3];
+        let names: Vec<String> = with_names_of_their_own(clips)
+            .into_iter()
+            .map(|clip| clip.name)
+            .collect();
+        assert_eq!(names, ["wave-1", "wave-1 (2)", "wave-1 (3)"]);
+    }
+
+    #[test]
+    fn idling_is_slow_and_punching_is_lively() {
+        assert!(hand_speed(&generate(Skill::Idle, 1)) < SLOW);
+        assert!(hand_speed(&generate(Skill::Punch, 1)) > SLOW);
     }
 }

@@ -48,7 +48,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         TrackingSettings::default(),
         trial.clips(&robot)?.into(),
         0..arguments.environments,
-        trial.seed,
+        trial.set.seed(),
     )?;
     let threads = learner_threads(trial.threads)?;
     let accuracy = accuracy::measure(&model, &mut environments, arguments.frames, &threads)?;

@@ -10,7 +10,11 @@ use anyhow::{Context as _, Result};
 use emp_models::emp::Emp;
 use emp_motion::atomic;
 use emp_robot::Robot;
-use emp_sim::{evaluation::Evaluation, suite::Condition};
+use emp_sim::{
+    evaluation::Evaluation,
+    metrics::{LIST, Metric, headings},
+    suite::Condition,
+};
 use serde::Serialize;
 
 use super::{judge::Judge, settings::EmpSettings};
@@ -127,26 +131,15 @@ impl fmt::Display for Table {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, condition) in self.conditions.iter().enumerate() {
             writeln!(f, "{} ({} clips)\n", condition.name(), self.episodes(index))?;
-            writeln!(
-                f,
-                "| | SUC ↑ | MJP ↑ | MSC ↓ N | MBV ↑ | MBA ↑ | MBO ↑ | MUS ↓ | change rad |"
-            )?;
-            writeln!(f, "|---|---|---|---|---|---|---|---|---|")?;
+            let change = LIST.iter().find(|metric| metric.name == "change");
+            let headings = headings().into_iter().chain(change.map(Metric::heading));
+            let headings: Vec<String> = headings.collect();
+            writeln!(f, "| | {} |", headings.join(" | "))?;
+            writeln!(f, "|---|{}", "---|".repeat(headings.len()))?;
             for row in &self.rows {
                 let metrics = &row.evaluations[index].all.metrics;
-                writeln!(
-                    f,
-                    "| {} | {:.1} % | {:.3} | {:.2} | {:.3} | {:.3} | {:.3} | {:.2} | {:.4} |",
-                    row.name,
-                    100.0 * metrics.suc.mean,
-                    metrics.mjp.mean,
-                    metrics.msc.mean,
-                    metrics.mbv.mean,
-                    metrics.mba.mean,
-                    metrics.mbo.mean,
-                    metrics.mus.mean,
-                    metrics.change.mean,
-                )?;
+                let (cells, change) = (metrics.cells(), metrics.change.mean);
+                writeln!(f, "| {} | {} | {change:.4} |", row.name, cells.join(" | "))?;
             }
             writeln!(f)?;
         }

@@ -9,7 +9,7 @@ use emp_motion::{Clip, skills};
 use emp_sim::goals::{GoalClip, Source};
 use serde_json::json;
 
-use crate::retargeter::data;
+use crate::{retargeter::data, sets::check_training_seed};
 
 /// What the clips are made from.
 pub struct Motions<'a> {
@@ -28,12 +28,13 @@ pub struct Motions<'a> {
 /// Clips, with a summary for a checkpoint's metadata.
 ///
 /// # Errors
-/// When a folder holds no motion, a file is broken, or the network fails.
+/// When a folder holds no motion or another set's, a file is broken, the seed is another set's, or the network fails.
 pub fn clips(
     retargeter: &Retargeter,
     motions: &Motions<'_>,
     threads: usize,
 ) -> Result<(Vec<GoalClip>, serde_json::Value)> {
+    check_training_seed(motions.seed)?;
     let (recorded, summary) = data::load_with_summary(motions.folders)?;
     let skills = skills::library(motions.seed, motions.procedural);
     let mut clips = Vec::new();

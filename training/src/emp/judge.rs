@@ -15,11 +15,13 @@ use emp_sim::{
 };
 use serde::Serialize;
 
+use crate::sets;
+
 /// Frames of a clip, as in the paper.
 const FRAMES: usize = 200;
 
-/// Seed of the clips. Training clips are made from other seeds.
-const SEED: u64 = 0x656d_705f_6865_6c64;
+/// Seed of the clips.
+const SEED: u64 = sets::EMP_JUDGE_SEED;
 
 /// Under what an EMP is judged.
 const TRIALS: [Condition; 5] = [
@@ -52,25 +54,29 @@ pub struct Figures {
     pub change: f64,
     /// Self-collision force as a share of that without the EMP.
     pub msc_ratio: f64,
-    /// Difference of the paper's joint position metric to that without the EMP.
+    /// The paper's joint position metric.
+    pub mjp: f64,
+    /// Its difference to that without the EMP.
     pub mjp_difference: f64,
 }
 
 impl Figures {
-    const NAMES: [&'static str; 5] = [
+    const NAMES: [&'static str; 6] = [
         "falls",
         "falls_decoupled",
         "change",
         "msc_ratio",
+        "mjp",
         "mjp_difference",
     ];
 
-    fn numbers(&self) -> [f64; 5] {
+    fn numbers(&self) -> [f64; 6] {
         [
             self.falls,
             self.falls_decoupled,
             self.change,
             self.msc_ratio,
+            self.mjp,
             self.mjp_difference,
         ]
     }
@@ -81,9 +87,21 @@ impl Figures {
 pub struct Verdict {
     /// Each trial.
     pub trials: Vec<Figures>,
+    /// Mean over the trials of the share that stood × joint tracking: by this, weights are chosen.
+    pub score: f64,
 }
 
 impl Verdict {
+    fn new(trials: Vec<Figures>) -> Self {
+        let scores = trials
+            .iter()
+            .map(|figures| (1.0 - figures.falls) * figures.mjp);
+        Self {
+            score: scores.sum::<f64>() / trials.len() as f64,
+            trials,
+        }
+    }
+
     /// Columns of a log.
     pub fn columns() -> Vec<String> {
         let mut columns = vec!["step".to_owned()];
@@ -91,12 +109,14 @@ impl Verdict {
             let names = Figures::NAMES.map(|name| format!("{name}_{}", trial.name()));
             columns.extend(names);
         }
+        columns.push("score".to_owned());
         columns
     }
 
     /// The numbers of a log's row.
     pub fn row(&self) -> Vec<f64> {
-        self.trials.iter().flat_map(Figures::numbers).collect()
+        let numbers = self.trials.iter().flat_map(Figures::numbers);
+        numbers.chain([self.score]).collect()
     }
 }
 
@@ -166,11 +186,10 @@ impl Judge {
                 falls_decoupled: 1.0 - without.suc.mean,
                 change: with.change.mean,
                 msc_ratio: with.msc.mean / without.msc.mean.max(1e-9),
+                mjp: with.mjp.mean,
                 mjp_difference: with.mjp.mean - without.mjp.mean,
             }
         });
-        Ok(Verdict {
-            trials: figures.collect(),
-        })
+        Ok(Verdict::new(figures.collect()))
     }
 }

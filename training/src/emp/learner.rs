@@ -280,7 +280,7 @@ impl Learner {
         threads: &rayon::ThreadPool,
         sums: &mut Sums,
     ) -> Result<()> {
-        let count = self.settings.optimizer.shards;
+        let count = mini_batch.shards(self.settings.optimizer.shards);
         let shards = threads.install(|| {
             let shards = (0..count).into_par_iter().map(|shard| {
                 let part = mini_batch.part(shard, count);
@@ -475,6 +475,11 @@ struct MiniBatch {
 }
 
 impl MiniBatch {
+    /// How many parts it is cut into, `most` at most: none is without rows, whose mean is no number.
+    fn shards(&self, most: usize) -> usize {
+        most.min(self.rows.len())
+    }
+
     /// One of `count` parts.
     fn part(&self, part: usize, count: usize) -> Self {
         let slice = |rows: &[usize]| {

@@ -27,16 +27,17 @@ pub struct Moments {
     pub goals_before: [Tensor; PAST],
 }
 
-/// The terms of the loss, unweighted: one number for each row of each imagined step, step by step.
+/// The terms of the loss, unweighted: one number for each row of each imagined step, step by step. Those of the robot's balance
+/// and clearance are computed only where they have a weight: they cost most.
 pub struct Terms {
     /// `L_rec`.
     pub reconstruction: Tensor,
     /// `L_ori`.
-    pub orientation: Tensor,
+    pub orientation: Option<Tensor>,
     /// `L_col`.
-    pub collision: Tensor,
+    pub collision: Option<Tensor>,
     /// `L_cen`.
-    pub centroid: Tensor,
+    pub centroid: Option<Tensor>,
     /// `L_smo`.
     pub smoothness: Tensor,
     /// `L_reg`.
@@ -54,14 +55,14 @@ impl Terms {
         "regularization",
     ];
 
-    fn all(&self) -> [&Tensor; 6] {
+    fn all(&self) -> [Option<&Tensor>; 6] {
         [
-            &self.reconstruction,
-            &self.orientation,
-            &self.collision,
-            &self.centroid,
-            &self.smoothness,
-            &self.regularization,
+            Some(&self.reconstruction),
+            self.orientation.as_ref(),
+            self.collision.as_ref(),
+            self.centroid.as_ref(),
+            Some(&self.smoothness),
+            Some(&self.regularization),
         ]
     }
 
@@ -79,20 +80,23 @@ impl Terms {
             weights.regularization,
         ];
         let start = self.reconstruction.zeros_like()?;
-        let mut terms = self.all().into_iter().zip(weights);
+        let terms = self.all().into_iter().zip(weights);
+        let mut terms = terms.filter_map(|(term, weight)| Some((term?, weight)));
         terms
             .try_fold(start, |sum, (term, weight)| sum + (term * weight)?)?
             .mean_all()
     }
 
-    /// The mean of each term over rows and steps, in the order of [`Self::NAMES`].
+    /// The mean of each term over rows and steps, in the order of [`Self::NAMES`]; not a number where it was not computed.
     ///
     /// # Errors
     /// When the tensor library fails.
     pub fn means(&self) -> candle_core::Result<[f64; 6]> {
-        let mut means = [0.0; 6];
+        let mut means = [f64::NAN; 6];
         for (mean, term) in means.iter_mut().zip(self.all()) {
-            *mean = term.mean_all()?.to_dtype(DType::F64)?.to_scalar()?;
+            if let Some(term) = term {
+                *mean = term.mean_all()?.to_dtype(DType::F64)?.to_scalar()?;
+            }
         }
         Ok(means)
     }
@@ -178,26 +182,51 @@ impl Objective {
             Tensor::cat(&steps.iter().map(part).collect::<Vec<_>>(), 0)
         };
         let executed = all(|step| &step.goal)?;
-        let orientation = all(|step| &step.orientation)?;
         let goals = self.goals(moments)?;
+        let [orientation, collision, centroid] = self.body(moments, &all, &executed, horizon)?;
+        Ok(Terms {
+            reconstruction: losses::reconstruction(&goals, &executed, self.settings.distance)?,
+            orientation,
+            collision,
+            centroid,
+            smoothness: self.smoothness(moments, &goals, &executed)?,
+            regularization: losses::regularization(&all(|step| &step.latent)?)?,
+        })
+    }
+
+    /// `L_ori`, `L_col` and `L_cen`, those that have a weight.
+    fn body(
+        &self,
+        moments: &Moments,
+        all: &dyn Fn(fn(&ImaginedStep) -> &Tensor) -> candle_core::Result<Tensor>,
+        executed: &Tensor,
+        horizon: usize,
+    ) -> candle_core::Result<[Option<Tensor>; 3]> {
+        let weights = &self.settings.weights;
+        let orientation = all(|step| &step.orientation)?;
+        let is_upright = (weights.orientation != 0.0)
+            .then(|| losses::orientation(&orientation))
+            .transpose()?;
+        if weights.collision == 0.0 && weights.centroid == 0.0 {
+            return Ok([is_upright, None, None]);
+        }
         let posture = match self.settings.cen_on {
             CenOn::Predicted => all(|step| &step.joint_positions)?,
             CenOn::QuasiStatic => {
                 let legs = self.legs(&moments.stacks)?.repeat((horizon, 1))?;
-                Tensor::cat(&[&executed, &legs], 1)?
+                Tensor::cat(&[executed, &legs], 1)?
             }
         };
         let outputs = self.kinematics.forward(&posture)?;
         let [center_of_mass, foot_support] = self.balance(&outputs, &orientation)?;
         let links = columns(&outputs, &self.outputs.link_centers)?;
-        Ok(Terms {
-            reconstruction: losses::reconstruction(&goals, &executed, self.settings.distance)?,
-            orientation: losses::orientation(&orientation)?,
-            collision: losses::collision(&links, &self.pairs)?,
-            centroid: losses::centroid(&center_of_mass, &foot_support, self.reference)?,
-            smoothness: self.smoothness(moments, &goals, &executed)?,
-            regularization: losses::regularization(&all(|step| &step.latent)?)?,
-        })
+        let is_clear = || losses::collision(&links, &self.pairs);
+        let is_balanced = || losses::centroid(&center_of_mass, &foot_support, self.reference);
+        Ok([
+            is_upright,
+            (weights.collision != 0.0).then(is_clear).transpose()?,
+            (weights.centroid != 0.0).then(is_balanced).transpose()?,
+        ])
     }
 
     /// The goals that were asked for, step by step.
@@ -507,8 +536,8 @@ mod tests {
                     centroids.push((-7.0 * (0.03 - distance)).exp().min(10.0) - 1.0);
                 }
             }
-            assert_near(&values(&terms.collision), &collisions);
-            assert_near(&values(&terms.centroid), &centroids);
+            assert_near(&values(terms.collision.as_ref().unwrap()), &collisions);
+            assert_near(&values(terms.centroid.as_ref().unwrap()), &centroids);
         }
     }
 
@@ -539,7 +568,7 @@ mod tests {
                 let terms = objective
                     .terms(&moments, std::slice::from_ref(&step))
                     .unwrap();
-                values(&terms.centroid)[0]
+                values(terms.centroid.as_ref().unwrap())[0]
             };
             let least = (-0.21_f64).exp() - 1.0;
             assert!(cost(&objective) > least + 0.01);
@@ -566,6 +595,26 @@ mod tests {
         assert_near(&values(&total), &[expected]);
         let mean = values(&terms.reconstruction).iter().sum::<f64>() / 4.0;
         assert_near(&[mean], &[rec]);
+    }
+
+    #[test]
+    fn a_term_without_weight_is_not_computed() {
+        let mut objective = objective(SmoothOn::Target, CenOn::Predicted);
+        let steps = [step(5.0), step(9.0)];
+        let all = objective.terms(&moments(), &steps).unwrap();
+        let weights = &mut objective.settings.weights;
+        (weights.orientation, weights.collision, weights.centroid) = (0.0, 0.0, 0.0);
+        let weights = *weights;
+        let some = objective.terms(&moments(), &steps).unwrap();
+        assert!(some.orientation.is_none() && some.collision.is_none() && some.centroid.is_none());
+        let means = some.means().unwrap();
+        let is_computed = means.map(f64::is_finite);
+        assert_eq!(is_computed, [true, false, false, false, true, true]);
+        let [ours, theirs] = [some, all].map(|terms| values(&terms.total(&weights).unwrap()));
+        assert_near(&ours, &theirs);
+        objective.settings.weights.centroid = 1.0;
+        let balanced = objective.terms(&moments(), &steps).unwrap();
+        assert!(balanced.centroid.is_some() && balanced.collision.is_none());
     }
 
     #[test]

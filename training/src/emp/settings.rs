@@ -153,6 +153,21 @@ impl Remedy {
         }
     }
 
+    /// The remedy as a filter's specification, for goals that nothing else changes.
+    pub fn filter(&self) -> String {
+        let Self {
+            joints,
+            amplitude,
+            speed,
+        } = self;
+        let joints = joints.join("+");
+        let limit = format!("velocity-limit:limit={speed},joints={joints}");
+        if *amplitude == 1.0 {
+            return limit;
+        }
+        format!("amplitude-cut:factor={amplitude},joints={joints}>{limit}")
+    }
+
     /// What falls of the shipped policy call for: waist, shoulder pitch and roll fell it (docs/emp.md).
     fn against_falls() -> Vec<Self> {
         let joints = ["waist", "shoulder_pitch", "shoulder_roll"];

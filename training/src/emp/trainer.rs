@@ -10,8 +10,9 @@ use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
 use emp_models::{
     CheckpointMetadata,
-    checkpoint::{self, Tensors},
+    checkpoint::{self, write_atomically},
     emp::{self, Emp, NETWORK_PREFIX},
+    mlp::shipped_tensors,
 };
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
@@ -28,7 +29,7 @@ use super::{
 use crate::{
     equipment::Equipment,
     log::CsvLog,
-    run::{self, Interrupt, Outcome, RunFiles},
+    run::{self, Interrupt, Outcome, RunFiles, Session},
 };
 
 /// Kind of the checkpoints in a run's folder, which hold the optimiser and the environments too.
@@ -70,9 +71,13 @@ pub struct Trainer {
     world_model: Option<String>,
     /// Environment steps of the EMP learnt from.
     steps: u64,
+    /// The best score of a judged EMP.
+    best_score: Option<f64>,
+    /// What the run was run by, command by command.
+    sessions: Vec<Session>,
 }
 
-/// A part of a run.
+/// A part of a run with settings of its own.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Phase {
     until_step: u64,
@@ -91,6 +96,8 @@ struct Saved {
     learner: learner::Progress,
     /// Version of the world model.
     world_model: Option<String>,
+    best_score: Option<f64>,
+    sessions: Vec<Session>,
 }
 
 /// A run's files and its judge.
@@ -140,6 +147,8 @@ impl Trainer {
             settings,
             past: Vec::new(),
             steps: 0,
+            best_score: None,
+            sessions: vec![Session::begin(0)],
         })
     }
 
@@ -195,6 +204,9 @@ impl Trainer {
             .restore(&tensors, saved.learner)
             .with_context(|| path.display().to_string())?;
         trainer.steps = saved.steps;
+        trainer.best_score = saved.best_score;
+        trainer.sessions = saved.sessions;
+        trainer.sessions.push(Session::begin(saved.steps));
         Ok(trainer)
     }
 
@@ -203,15 +215,13 @@ impl Trainer {
         self.steps
     }
 
-    /// The EMP as it is now.
+    /// The EMP as it would be served now: with the precision of the file that ships.
     ///
     /// # Errors
     /// When a tensor cannot be made.
     pub fn emp(&self) -> Result<Emp> {
-        let mut tensors: Tensors = self.learner.normalizer().tensors()?.into_iter().collect();
-        for (name, tensor) in self.learner.average() {
-            tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor.clone());
-        }
+        let (normalizer, average) = (self.learner.normalizer(), self.learner.average());
+        let tensors = shipped_tensors(NETWORK_PREFIX, normalizer, average)?;
         let robot = &self.equipment.robot;
         let metadata = CheckpointMetadata::for_joints(emp::KIND, robot, robot.joints());
         let config = self.learner.network().config().clone();
@@ -229,7 +239,7 @@ impl Trainer {
         verdict: &Verdict,
     ) -> Result<CheckpointMetadata> {
         let training = serde_json::json!({
-            "command": "emp-train emp",
+            "sessions": self.sessions,
             "settings": self.settings,
             "past": self.past,
             "steps": self.steps,
@@ -268,9 +278,21 @@ impl Trainer {
             steps: self.steps,
             learner: self.learner.progress(),
             world_model: self.world_model.clone(),
+            best_score: self.best_score,
+            sessions: self.sessions.clone(),
         })?;
         checkpoint::save(path, metadata, &tensors)?;
         Ok(())
+    }
+
+    /// Judges the EMP, and keeps its weights if it is the best so far.
+    fn judge(&mut self, run: &Run<'_>) -> Result<Verdict> {
+        let verdict = run.judge.judge(self.emp()?)?;
+        if self.best_score.is_none_or(|best| verdict.score > best) {
+            self.best_score = Some(verdict.score);
+            self.export(&run.files.best(), &run.data, &verdict)?;
+        }
+        Ok(verdict)
     }
 
     /// Collects a rollout and learns from it.
@@ -394,9 +416,8 @@ pub fn train(
         bar.set_message(step.message());
         let every = trainer.settings.evaluate_every.max(1);
         if before / every < trainer.steps() / every || trainer.steps() >= steps {
-            let verdict = run.judge.judge(trainer.emp()?)?;
+            let verdict = trainer.judge(run)?;
             verdicts.row(trainer.steps(), &verdict.row())?;
-            trainer.export(&run.files.weights, &run.data, &verdict)?;
         }
         if saved.elapsed() >= run.files.save_every {
             trainer.save_run(&run.files.checkpoint())?;
@@ -404,6 +425,13 @@ pub fn train(
         }
     }
     trainer.save_run(&run.files.checkpoint())?;
+    let best = run.files.best();
+    if best != run.files.weights {
+        let weights =
+            std::fs::read(&best).with_context(|| format!("reading {}", best.display()))?;
+        write_atomically(&run.files.weights, &weights)
+            .with_context(|| format!("writing {}", run.files.weights.display()))?;
+    }
     bar.finish();
     Ok(Outcome::Finished)
 }

@@ -8,13 +8,13 @@ use emp_motion::skills;
 use emp_sim::goals::{GoalClip, GoalLibrary, Source};
 use serde_json::json;
 
-use crate::retargeter::data;
+use crate::{retargeter::data, sets::check_training_seed};
 
 /// Recorded motion from `folders` and `procedural` skills that follow from `seed`, with a summary for a checkpoint's
 /// metadata. The library's streams mirror its clips and vary their tempo.
 ///
 /// # Errors
-/// When a folder holds no motion, a file is broken, or the network fails.
+/// When a folder holds no motion or another set's, a file is broken, the seed is another set's, or the network fails.
 pub fn library(
     retargeter: &Retargeter,
     folders: &[PathBuf],
@@ -22,6 +22,7 @@ pub fn library(
     seed: u64,
     threads: usize,
 ) -> Result<(GoalLibrary, serde_json::Value)> {
+    check_training_seed(seed)?;
     let (recorded, summary) = data::load_with_summary(folders)?;
     let skills: Vec<_> = skills::library(seed, procedural)
         .iter()

@@ -7,22 +7,24 @@ use emp_models::{controller::Controller, policy::Policy, retarget::Retargeter};
 use emp_motion::skills;
 use emp_sim::{
     Pool,
-    evaluation::{Conditions, EvaluationSettings, evaluate},
+    evaluation::{EvaluationSettings, RandomizationLevel, evaluate},
     goals::{GoalClip, Source},
 };
 use serde::Serialize;
 
+use crate::sets;
+
 /// Frames of a clip, as in the paper.
 const FRAMES: usize = 200;
 
-/// Seed of the clips. Training clips are made from other seeds.
-const SEED: u64 = 0x6865_6c64_5f6f_7574;
+/// Seed of the clips.
+const SEED: u64 = sets::POLICY_JUDGE_SEED;
 
 /// Under what a policy is judged: name, factor on the goals' amplitude, conditions.
-const TRIALS: [(&str, f64, Conditions); 3] = [
-    ("nominal", 1.0, Conditions::Nominal),
-    ("amplitude", 1.2, Conditions::Nominal),
-    ("randomized", 1.0, Conditions::Full),
+const TRIALS: [(&str, f64, RandomizationLevel); 3] = [
+    ("nominal", 1.0, RandomizationLevel::Nominal),
+    ("amplitude", 1.2, RandomizationLevel::Nominal),
+    ("randomized", 1.0, RandomizationLevel::Full),
 ];
 
 /// Judges policies on procedural clips that they were not trained on.

@@ -7,9 +7,12 @@ use emp_models::controller::Controller;
 use emp_motion::atomic;
 use emp_sim::{
     Pool,
-    evaluation::{Conditions, Evaluation, EvaluationSettings, Failure, Progress, Scores, evaluate},
-    goals::{GoalClip, GoalLibrary},
+    evaluation::{
+        Evaluation, EvaluationSettings, Failure, Progress, RandomizationLevel, Scores, evaluate,
+    },
+    goals::{GoalClip, GoalLibrary, Spread},
     ladder::{Axis, Ladder, Rung, climb},
+    metrics::headings,
 };
 use plotters::{
     prelude::{
@@ -20,6 +23,8 @@ use plotters::{
 };
 use serde::Serialize;
 
+use crate::sets::{Basis, ClipGroup, MotionSet};
+
 /// Frames of a clip, as in the paper.
 pub const FRAMES: usize = 200;
 
@@ -29,41 +34,52 @@ const AMPLITUDE: f64 = 1.2;
 /// Episodes of the trial under full randomisation, and their frames: ten seconds.
 const RANDOMIZED: (u64, usize) = (500, 500);
 
+/// What the motion of that trial is called.
+const MIXED: &str = "random pieces of all";
+
 /// Failures of a trial that the text lists.
 const LISTED: usize = 12;
 
 /// Size of one panel of the ladder's picture, pixels.
 const PANEL: (u32, u32) = (480, 360);
 
-/// One controller under one trial's conditions.
+/// One controller under one trial's conditions, on one kind of motion.
 #[derive(Debug, Serialize)]
 pub struct Trial {
     /// What the conditions are.
     name: &'static str,
+    /// The kind of motion.
+    group: &'static str,
     /// What came of it.
     #[serde(flatten)]
     evaluation: Evaluation,
 }
 
-/// Every trial of every controller. As JSON a list of objects; [`Display`](fmt::Display) writes a table in Markdown.
+/// Every trial of every controller. [`Display`](fmt::Display) writes tables in Markdown.
 #[derive(Debug, Serialize)]
-#[serde(transparent)]
-pub struct Report(Vec<Trial>);
+pub struct Report {
+    /// What it rests on.
+    basis: Basis,
+    /// Controller by controller.
+    trials: Vec<Trial>,
+}
 
-/// Runs each controller on `clips` as they are and with a larger amplitude, and for ten seconds at a time on random pieces of
-/// the clips under full randomisation with pushes.
+/// Runs each controller on clips of `set` as they are and with a larger amplitude, and for ten seconds at a time on random
+/// pieces of all of them under full randomisation with pushes.
 ///
 /// # Errors
 /// When there is no clip, or a policy fails.
 pub fn report(
     pool: &Pool,
     controllers: &[Controller],
-    clips: &[GoalClip],
-    seed: u64,
+    groups: &[ClipGroup],
+    set: MotionSet,
     progress: &mut dyn Progress,
 ) -> Result<Report> {
     let first = controllers.first().context("expected a controller")?;
-    let library = GoalLibrary::new(first.policy().robot(), clips.to_vec())?;
+    let seed = set.seed();
+    let clips = groups.iter().flat_map(|group| group.clips.clone());
+    let library = GoalLibrary::new(first.policy().robot(), clips.collect())?;
     let (episodes, frames) = RANDOMIZED;
     let long: Vec<GoalClip> = (0..episodes)
         .map(|episode| library.sample(seed.wrapping_add(episode), 1.0, frames))
@@ -77,23 +93,32 @@ pub fn report(
         ..nominal
     };
     let full = EvaluationSettings {
-        conditions: Conditions::Full,
+        conditions: RandomizationLevel::Full,
         ..nominal
     };
-    let trials = [
-        ("nominal", clips, nominal),
-        ("amplitude × 1.2", clips, wide),
-        ("full randomisation, 10 s", &long, full),
-    ];
+    let groups_under = |name, settings| {
+        let trial = move |group: &'_ ClipGroup| (name, group.name, group.clips.clone(), settings);
+        groups.iter().map(trial)
+    };
+    let mut trials: Vec<_> = groups_under("nominal", nominal).collect();
+    trials.extend(groups_under("amplitude × 1.2", wide));
+    trials.push(("full randomisation, 10 s", MIXED, long, full));
     let mut rows = Vec::new();
     for controller in controllers {
-        for (name, clips, settings) in &trials {
+        for (name, group, clips, settings) in &trials {
             let evaluation = evaluate(pool, controller, clips, settings, progress)?;
             ensure!(evaluation.complete, "interrupted in the trial {name:?}");
-            rows.push(Trial { name, evaluation });
+            rows.push(Trial {
+                name,
+                group,
+                evaluation,
+            });
         }
     }
-    Ok(Report(rows))
+    Ok(Report {
+        basis: Basis::new(set, groups),
+        trials: rows,
+    })
 }
 
 /// Runs the controllers up the difficulty ladder.
@@ -123,78 +148,89 @@ pub fn ladder(
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let headings = headings();
+        writeln!(f, "On {}.\n", self.basis)?;
         writeln!(
             f,
-            "| controller | conditions | clips | SUC (95 %) | MJP | MSC N | self-collision | MBV | MBA | MBO | MUS |"
+            "| controller | conditions | clips of motions | {} |",
+            headings.join(" | ")
         )?;
-        writeln!(f, "|---|---|---|---|---|---|---|---|---|---|---|")?;
-        for Trial { name, evaluation } in &self.0 {
-            let controller = &evaluation.controller;
-            for (source, scores) in sources(evaluation) {
-                write!(f, "| {controller} | {name} | {source} {} ", scores.episodes)?;
-                write_metrics(f, scores)?;
+        writeln!(f, "|---|---|---|{}", "---|".repeat(headings.len()))?;
+        for Trial {
+            name,
+            group,
+            evaluation,
+        } in &self.trials
+        {
+            let Scores {
+                episodes,
+                motions,
+                metrics,
+                ..
+            } = &evaluation.all;
+            writeln!(
+                f,
+                "| {} | {name} | {group}: {episodes} of {motions} | {} |",
+                evaluation.controller,
+                metrics.cells().join(" | ")
+            )?;
+        }
+        self.write_goals(f)?;
+        self.write_failures(f)
+    }
+}
+
+impl Report {
+    /// How hard the clips are: the same for every controller.
+    fn write_goals(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "\n| conditions, motion | fastest joint rad/s, mean / p95 | faster hand m/s | farthest joint from the default pose, rad |"
+        )?;
+        writeln!(f, "|---|---|---|---|")?;
+        let first = self
+            .trials
+            .first()
+            .map(|trial| &trial.evaluation.controller);
+        for Trial {
+            name,
+            group,
+            evaluation,
+        } in &self.trials
+        {
+            let is_first = Some(&evaluation.controller) == first;
+            if let Some(goals) = evaluation.all.goals.filter(|_| is_first) {
+                let spreads = [goals.joint_speed, goals.hand_speed, goals.amplitude];
+                let spreads = spreads.map(|Spread { mean, p95 }| format!("{mean:.2} / {p95:.2}"));
+                writeln!(f, "| {name}, {group} | {} |", spreads.join(" | "))?;
             }
         }
-        writeln!(f)?;
-        for Trial { name, evaluation } in &self.0 {
-            for (source, scores) in sources(evaluation) {
-                if let Some(goals) = scores.goals {
-                    writeln!(
-                        f,
-                        "{} {name}, {source}: fastest joint {:.2} rad/s (p95 {:.2}), faster hand {:.2} m/s (p95 {:.2}), \
-                         farthest joint {:.2} rad from the default pose (p95 {:.2})",
-                        evaluation.controller,
-                        goals.joint_speed.mean,
-                        goals.joint_speed.p95,
-                        goals.hand_speed.mean,
-                        goals.hand_speed.p95,
-                        goals.amplitude.mean,
-                        goals.amplitude.p95
-                    )?;
-                }
+        writeln!(f)
+    }
+
+    fn write_failures(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for Trial {
+            name,
+            group,
+            evaluation,
+        } in &self.trials
+        {
+            let failures = &evaluation.failures;
+            if !failures.is_empty() {
+                writeln!(f, "{} {name}, {group}:", evaluation.controller)?;
             }
             for Failure {
                 clip, time, reason, ..
-            } in evaluation.failures.iter().take(LISTED)
+            } in failures.iter().take(LISTED)
             {
                 writeln!(f, "  {clip} at {time:.2} s: {reason}")?;
             }
-            if let Some(more) = evaluation.failures.len().checked_sub(LISTED + 1) {
+            if let Some(more) = failures.len().checked_sub(LISTED + 1) {
                 writeln!(f, "  and {} more, all in --json", more + 1)?;
             }
         }
         Ok(())
     }
-}
-
-/// The scores by source, those that there are.
-fn sources(evaluation: &Evaluation) -> impl Iterator<Item = (&'static str, &Scores)> {
-    let sources = [
-        ("recorded", &evaluation.recorded),
-        ("procedural", &evaluation.procedural),
-    ];
-    sources
-        .into_iter()
-        .filter_map(|(name, scores)| Some((name, scores.as_ref()?)))
-}
-
-fn write_metrics(f: &mut fmt::Formatter<'_>, scores: &Scores) -> fmt::Result {
-    let metrics = &scores.metrics;
-    let suc = metrics.suc;
-    writeln!(
-        f,
-        "| {:.3} ({:.3}–{:.3}) | {:.3} | {:.2} | {:.1} % | {:.3} | {:.3} | {:.3} | {:.3} |",
-        suc.mean,
-        suc.low,
-        suc.high,
-        metrics.mjp.mean,
-        metrics.msc.mean,
-        100.0 * metrics.self_collision_share.mean,
-        metrics.mbv.mean,
-        metrics.mba.mean,
-        metrics.mbo.mean,
-        metrics.mus.mean
-    )
 }
 
 /// Draws success along each axis of the ladder, one line a controller, with the intervals' ends.
@@ -297,6 +333,7 @@ mod tests {
             controller: controller.to_owned(),
             rung: Rung { axis, value },
             episodes: 10,
+            motions: 10,
             metrics: Metrics::from([interval(1.0 / (1.0 + value)); METRICS]),
         };
         let rows = Axis::ALL.into_iter().flat_map(|axis| {

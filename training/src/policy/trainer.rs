@@ -7,6 +7,7 @@ use candle_core::{Device, Tensor};
 use emp_models::{
     CheckpointMetadata,
     checkpoint::{self, Tensors},
+    mlp::shipped_tensors,
     policy::{self, NETWORK_PREFIX, Policy, PolicyConfig},
 };
 use emp_motion::atomic;
@@ -202,15 +203,23 @@ impl Trainer {
         for (name, tensor) in self.learner.actor()? {
             tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor);
         }
-        let metadata =
-            CheckpointMetadata::for_joints(policy::KIND, &self.robot, self.robot.joints());
-        Policy::from_tensors(
-            self.config.clone(),
-            Arc::clone(&self.robot),
-            tensors,
-            metadata,
-        )
-        .map_err(anyhow::Error::msg)
+        self.from_tensors(tensors)
+    }
+
+    /// The policy as it would be served now: with the precision of the file that ships.
+    ///
+    /// # Errors
+    /// When a tensor cannot be made.
+    fn shipped(&self) -> Result<Policy> {
+        let (normalizer, actor) = (self.learner.normalizer(), self.learner.actor()?);
+        let tensors = shipped_tensors(NETWORK_PREFIX, &normalizer, &actor)?;
+        self.from_tensors(tensors)
+    }
+
+    fn from_tensors(&self, tensors: Tensors) -> Result<Policy> {
+        let (config, robot) = (self.config.clone(), Arc::clone(&self.robot));
+        let metadata = CheckpointMetadata::for_joints(policy::KIND, &robot, robot.joints());
+        Policy::from_tensors(config, robot, tensors, metadata).map_err(anyhow::Error::msg)
     }
 
     /// Writes the policy for serving: the network as f16.
@@ -224,7 +233,7 @@ impl Trainer {
         verdict: &Verdict,
     ) -> Result<CheckpointMetadata> {
         let training = serde_json::json!({
-            "command": "emp-train policy",
+            "command": run::command_line(),
             "settings": self.settings,
             "steps": self.steps,
             "data": data,
@@ -268,7 +277,7 @@ impl Trainer {
 
     /// Judges the policy, and keeps its weights if it is the best so far.
     fn judge(&mut self, run: &Run<'_>) -> Result<Verdict> {
-        let verdict = run.judge.judge(self.policy()?)?;
+        let verdict = run.judge.judge(self.shipped()?)?;
         if self.best_score.is_none_or(|best| verdict.score > best) {
             self.best_score = Some(verdict.score);
             self.export(&run.files.best(), &run.data, &verdict)?;

@@ -8,6 +8,8 @@ use emp_motion::{Clip, skills};
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
 use rand::{Rng, RngExt as _};
 
+use crate::sets::{MotionSet, check_training_seed};
+
 /// The rate at which robots are driven, and motion is sampled, Hz.
 pub const RATE: f64 = 50.0;
 
@@ -45,8 +47,9 @@ impl Dataset {
     /// Recorded `clips` and `procedural` skill clips, all of them also mirrored.
     ///
     /// # Errors
-    /// When no procedural clip is asked for: they are always in the mix.
+    /// When no procedural clip is asked for: they are always in the mix; when the seed is another set's.
     pub fn new(clips: &[Clip], procedural: usize, seed: u64) -> Result<Self> {
+        check_training_seed(seed)?;
         let skills = skills::library(seed, procedural);
         let dataset = Self {
             recorded: targets(clips),
@@ -121,11 +124,12 @@ fn small_rotation(angle: f64, rng: &mut impl Rng) -> Rotation3<f64> {
     }
 }
 
-/// Reads clips and names what was read, for a checkpoint's metadata.
+/// Reads clips to train on and names what was read, for a checkpoint's metadata.
 ///
 /// # Errors
-/// As [`load_clips`].
+/// As [`load_clips`]; when a folder is of another set.
 pub fn load_with_summary(folders: &[PathBuf]) -> Result<(Vec<Clip>, serde_json::Value)> {
+    MotionSet::Train.check(folders)?;
     let clips = load_clips(folders).context("reading the motions")?;
     let frames: usize = clips.iter().map(|clip| clip.frames.len()).sum();
     let names: Vec<String> = folders

@@ -170,7 +170,7 @@ impl Trainer {
         metadata.config = serde_json::to_value(NetworkConfig::default())?;
         metadata.git_revision = run::git_revision();
         metadata.training = serde_json::json!({
-            "command": "emp-train retargeter",
+            "command": run::command_line(),
             "settings": self.settings,
             "step": self.steps(),
             "recorded_motion": data,

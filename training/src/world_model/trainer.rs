@@ -170,7 +170,7 @@ impl Trainer {
     /// When the file cannot be written.
     pub fn export(&self, path: &Path, data: &serde_json::Value) -> Result<CheckpointMetadata> {
         let training = serde_json::json!({
-            "command": "emp-train world-model",
+            "command": run::command_line(),
             "settings": self.settings,
             "steps": self.steps(),
             "policy": self.equipment.policy.metadata().version(),

@@ -20,13 +20,6 @@ pub(super) fn auroc(positive: &[f64], negative: &[f64]) -> Option<f64> {
     Some(wins / (positive.len() as f64 * negative.len() as f64))
 }
 
-/// The value below which `share` of `values` lie (nearest rank); none of none.
-pub(in crate::emp) fn percentile(mut values: Vec<f64>, share: f64) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    let last = values.len().checked_sub(1)?;
-    values.get((share * last as f64).round() as usize).copied()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -40,13 +33,5 @@ mod tests {
         assert_eq!(auroc(&[1.0; 3], &[1.0; 7]), Some(0.5));
         assert_eq!(auroc(&[], &[1.0]), None);
         assert_eq!(auroc(&[1.0], &[]), None);
-    }
-
-    #[test]
-    fn percentiles_are_by_rank() {
-        let values: Vec<f64> = (0..=100).rev().map(f64::from).collect();
-        assert_eq!(percentile(values.clone(), 0.99), Some(99.0));
-        assert_eq!(percentile(values, 0.5), Some(50.0));
-        assert_eq!(percentile(Vec::new(), 0.5), None);
     }
 }

@@ -17,19 +17,22 @@ use emp_models::{
 };
 use emp_sim::{
     Pool,
-    evaluation::{Evaluation, EvaluationSettings, Observer, Progress, evaluate_observed},
+    evaluation::{
+        EpisodeResult, Evaluation, EvaluationSettings, Observer, Progress, evaluate_observed,
+    },
     goals::GoalClip,
-    metrics::{EpisodeSums, Interval, paired_difference},
+    metrics::{Interval, Sample, failures, paired_difference},
+    quantile::quantile_of,
     suite::Condition,
 };
 use nalgebra::Vector2;
 use serde::Serialize;
 
+use crate::sets::Basis;
 use auroc::auroc;
-pub(super) use auroc::percentile;
 use cuts::Cut;
 pub use reach::Reaches;
-use trace::{Moment, Tracer};
+use trace::{TracedFrame, Tracer};
 
 /// How long before a fall something shows, frames: from the first up to the second, exclusive.
 pub const LEADS: [(usize, usize); 3] = [(15, 30), (30, 65), (65, 110)];
@@ -45,10 +48,8 @@ const TILTED: f64 = 0.99;
 pub struct FallReport {
     /// Name of the robot.
     robot: String,
-    /// Clips an evaluation.
-    clips: usize,
-    /// Seed of loads, pushes and randomisation.
-    seed: u64,
+    /// What it rests on.
+    basis: Basis,
     /// Where the centre of mass is in frames of nominal episodes that stood.
     nominal: OperatingPoint,
     /// One condition after the other.
@@ -127,7 +128,7 @@ pub struct CutFalls {
     name: String,
     /// Number of falls.
     falls: usize,
-    /// Change of the share of falls, with its 95 % interval over pairs.
+    /// Change of the share of falls, with its 95 % interval over motions.
     change: Interval,
 }
 
@@ -141,10 +142,10 @@ pub struct FallRun<'a> {
     pub emp: Option<Arc<Emp>>,
     /// Motion.
     pub clips: &'a [GoalClip],
+    /// What the motion is, for the report's first line.
+    pub basis: &'a Basis,
     /// Conditions to fall under.
     pub conditions: &'a [Condition],
-    /// Seed of loads, pushes and randomisation.
-    pub seed: u64,
     /// Whether to cut one thing at a time, which takes many times as long as the rest.
     pub cuts: bool,
 }
@@ -154,11 +155,11 @@ struct Traced {
     condition: Condition,
     raw: Evaluation,
     /// Frames of the raw episodes, by number.
-    episodes: Vec<Vec<Moment>>,
+    episodes: Vec<Vec<TracedFrame>>,
     /// Which way the robot falls with the clips in the mirror.
     mirrored: Directions,
     /// The same episodes with one thing cut, by its name.
-    cuts: Vec<(String, Vec<EpisodeSums>)>,
+    cuts: Vec<(String, Vec<Sample>)>,
 }
 
 /// Finds out what fells a policy.
@@ -191,11 +192,10 @@ pub fn report(run: &FallRun<'_>, progress: &mut dyn Progress) -> Result<FallRepo
     let safe = OperatingPoint::of(nominal.standing());
     let nominal = safe.context("expected an episode that stands under nominal conditions")?;
     let rate = run.policy.robot().control_rate_hz();
-    let falls = |traced: &[Traced]| falls(traced, &nominal, rate, run.seed);
+    let falls = |traced: &[Traced]| falls(traced, &nominal, rate, run.basis.seed);
     Ok(FallReport {
         robot: run.policy.robot().name().to_owned(),
-        clips: run.clips.len(),
-        seed: run.seed,
+        basis: run.basis.clone(),
         conditions: traced.chunks(1).map(falls).collect(),
         all: falls(&traced),
         nominal,
@@ -210,7 +210,7 @@ fn evaluation(
     progress: &mut dyn Progress,
 ) -> Result<Evaluation> {
     let controller = Controller::new(Arc::clone(run.policy), filter);
-    let settings: EvaluationSettings = condition.settings(run.policy.robot(), run.seed);
+    let settings: EvaluationSettings = condition.settings(run.policy.robot(), run.basis.seed);
     let evaluation = evaluate_observed(
         run.pool,
         &controller,
@@ -247,45 +247,39 @@ fn cut(
     run: &FallRun<'_>,
     condition: Condition,
     progress: &mut dyn Progress,
-) -> Result<Vec<(String, Vec<EpisodeSums>)>> {
+) -> Result<Vec<(String, Vec<Sample>)>> {
     let mut cuts = Vec::new();
     for mut cut in Cut::all(run.policy.robot())? {
         let evaluation = evaluation(run, condition, cut.filter, &mut cut.sender, progress)?;
-        cuts.push((cut.name, sums(&evaluation)));
+        cuts.push((cut.name, samples(&evaluation)));
     }
     Ok(cuts)
 }
 
-fn sums(evaluation: &Evaluation) -> Vec<EpisodeSums> {
-    evaluation
-        .results
-        .iter()
-        .map(|result| result.sums)
-        .collect()
-}
-
-fn fallen(sums: &[EpisodeSums]) -> usize {
-    sums.iter()
-        .filter(|episode| episode.sums.suc == 0.0)
-        .count()
+fn samples(evaluation: &Evaluation) -> Vec<Sample> {
+    let results = evaluation.results.iter();
+    results.map(EpisodeResult::sample).collect()
 }
 
 impl Traced {
     /// The episodes with or without a fall.
-    fn of(&self, fell: bool) -> impl Iterator<Item = &[Moment]> + Clone {
+    fn of(&self, fell: bool) -> impl Iterator<Item = &[TracedFrame]> + Clone {
         let results = self.raw.results.iter();
         let chosen = results.filter(move |result| result.failure.is_some() == fell);
         chosen.map(|result| self.episodes[result.episode].as_slice())
     }
 
     /// Frames of episodes without a fall, once the robot has settled.
-    fn standing(&self) -> impl Iterator<Item = &Moment> + Clone {
+    fn standing(&self) -> impl Iterator<Item = &TracedFrame> + Clone {
         self.of(false)
             .flat_map(|frames| frames.iter().skip(SETTLING))
     }
 
     /// Frames whose episode ends in a fall so many frames later.
-    fn before_falls(&self, (from, to): (usize, usize)) -> impl Iterator<Item = &Moment> + Clone {
+    fn before_falls(
+        &self,
+        (from, to): (usize, usize),
+    ) -> impl Iterator<Item = &TracedFrame> + Clone {
         self.of(true).flat_map(move |frames| {
             let at = |lead: usize| frames.len().saturating_sub(lead);
             &frames[at(to)..at(from)]
@@ -294,17 +288,17 @@ impl Traced {
 }
 
 fn falls(traced: &[Traced], nominal: &OperatingPoint, rate: f64, seed: u64) -> Falls {
-    let raw: Vec<EpisodeSums> = traced.iter().flat_map(|one| sums(&one.raw)).collect();
+    let raw: Vec<Sample> = traced.iter().flat_map(|one| samples(&one.raw)).collect();
     let ends = traced.iter().flat_map(|one| one.of(true));
     let widest = (LEADS[0].0, LEADS[LEADS.len() - 1].1);
     let before = traced.iter().flat_map(|one| one.before_falls(widest));
     let ever = traced.iter().flat_map(|one| one.episodes.iter().flatten());
     let standing = traced.iter().flat_map(Traced::standing);
-    let tilted = percentile(standing.clone().map(|moment| moment.tilt).collect(), TILTED);
+    let tilted = quantile_of(standing.clone().map(|moment| moment.tilt).collect(), TILTED);
     Falls {
         conditions: traced.iter().map(|one| one.condition.name()).collect(),
         episodes: raw.len(),
-        falls: fallen(&raw),
+        falls: failures(&raw),
         directions: Directions::of(ends.clone()),
         mirrored: traced.iter().map(|one| one.mirrored).sum(),
         reach_before: Reaches::shares(before.map(|moment| moment.reach)),
@@ -323,24 +317,24 @@ fn falls(traced: &[Traced], nominal: &OperatingPoint, rate: f64, seed: u64) -> F
 }
 
 /// Median number of frames in which the tilt stays above `tilted` before the fall.
-fn frames_from_tilt<'a>(ends: impl Iterator<Item = &'a [Moment]>, tilted: f64) -> Option<f64> {
-    let tilting = |frames: &[Moment]| {
+fn frames_from_tilt<'a>(ends: impl Iterator<Item = &'a [TracedFrame]>, tilted: f64) -> Option<f64> {
+    let tilting = |frames: &[TracedFrame]| {
         let last = frames.iter().rev();
         last.take_while(|moment| moment.tilt > tilted).count() as f64
     };
-    percentile(ends.map(tilting).collect(), 0.5)
+    quantile_of(ends.map(tilting).collect(), 0.5)
 }
 
 /// The falls with each cut, over the episodes of all conditions.
-fn cut_falls(traced: &[Traced], raw: &[EpisodeSums], seed: u64) -> Vec<CutFalls> {
+fn cut_falls(traced: &[Traced], raw: &[Sample], seed: u64) -> Vec<CutFalls> {
     let names = traced.first().map_or(&[][..], |one| &one.cuts);
-    let row = |(index, (name, _)): (usize, &(String, Vec<EpisodeSums>))| {
+    let row = |(index, (name, _)): (usize, &(String, Vec<Sample>))| {
         let cut = traced.iter().flat_map(|one| &one.cuts[index].1);
-        let cut: Vec<EpisodeSums> = cut.copied().collect();
+        let cut: Vec<Sample> = cut.cloned().collect();
         let Interval { mean, low, high } = paired_difference(&cut, raw, seed).suc;
         CutFalls {
             name: name.clone(),
-            falls: fallen(&cut),
+            falls: failures(&cut),
             change: Interval {
                 mean: -mean,
                 low: -high,
@@ -352,7 +346,7 @@ fn cut_falls(traced: &[Traced], raw: &[EpisodeSums], seed: u64) -> Vec<CutFalls>
 }
 
 impl Directions {
-    fn of<'a>(falls: impl Iterator<Item = &'a [Moment]>) -> Self {
+    fn of<'a>(falls: impl Iterator<Item = &'a [TracedFrame]>) -> Self {
         let mut directions = Self::default();
         for lean in falls.filter_map(|frames| Some(frames.last()?.lean)) {
             let count = match (lean.x.abs() > lean.y.abs(), lean.x > 0.0, lean.y > 0.0) {
@@ -380,7 +374,7 @@ impl Sum for Directions {
 
 impl OperatingPoint {
     /// Of frames in which the robot stands; none of none.
-    fn of<'a>(standing: impl Iterator<Item = &'a Moment> + Clone) -> Option<Self> {
+    fn of<'a>(standing: impl Iterator<Item = &'a TracedFrame> + Clone) -> Option<Self> {
         let measured = spread(standing.clone().map(|moment| moment.measured_com))?;
         let quasi_static = spread(standing.map(|moment| moment.static_com))?;
         Some(Self {
@@ -408,7 +402,7 @@ fn spread(points: impl Iterator<Item = Vector2<f64>>) -> Option<[[f64; 2]; 2]> {
 }
 
 /// A number of a frame, none where it is not known.
-type Value = fn(&Moment, &OperatingPoint) -> Option<f64>;
+type Value = fn(&TracedFrame, &OperatingPoint) -> Option<f64>;
 
 /// Names of signs of falls, and their values.
 const SIGNALS: [(&str, Value); 10] = [
@@ -448,9 +442,9 @@ const SIGNALS: [(&str, Value); 10] = [
 fn signal(
     name: &'static str,
     traced: &[Traced],
-    value: impl Fn(&Moment) -> Option<f64>,
+    value: impl Fn(&TracedFrame) -> Option<f64>,
 ) -> Option<Signal> {
-    let values = |frames: &mut dyn Iterator<Item = &Moment>| -> Vec<f64> {
+    let values = |frames: &mut dyn Iterator<Item = &TracedFrame>| -> Vec<f64> {
         frames.filter_map(&value).collect()
     };
     let mut frames = [0; LEADS.len()];

@@ -6,13 +6,8 @@ use super::{CutFalls, Directions, FallReport, Falls, LEADS, OperatingPoint, Reac
 
 impl fmt::Display for FallReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            robot, clips, seed, ..
-        } = self;
-        writeln!(
-            f,
-            "{robot}, {clips} clips under each condition, seed {seed}.\n"
-        )?;
+        let Self { robot, basis, .. } = self;
+        writeln!(f, "{robot} on {basis}.\n")?;
         self.write_falls(f)?;
         self.write_reach(f)?;
         self.write_cuts(f)?;

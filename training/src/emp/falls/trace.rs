@@ -9,9 +9,9 @@ use nalgebra::{UnitQuaternion, Vector2};
 
 use super::reach::{Reach, ReachMeter};
 
-/// One frame.
+/// What is kept of one frame.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Moment {
+pub(super) struct TracedFrame {
     /// From the feet's middle to the centre of mass of the robot upright with its legs in the default pose and its arms at the
     /// executed goal: x forward, y left, metres.
     pub(super) static_com: Vector2<f64>,
@@ -42,7 +42,7 @@ pub(super) struct Tracer {
     /// A row of the kinematics.
     row: Vec<f64>,
     /// Frames by episode.
-    pub(super) episodes: Vec<Vec<Moment>>,
+    pub(super) episodes: Vec<Vec<TracedFrame>>,
 }
 
 impl Tracer {
@@ -72,7 +72,7 @@ impl Tracer {
 impl Observer for Tracer {
     fn executed(&mut self, frame: &ExecutedFrame<'_>) {
         let gravity = projected_gravity(&frame.reading.orientation);
-        let moment = Moment {
+        let moment = TracedFrame {
             static_com: self.static_com(&frame.output.goal),
             measured_com: frame.reading.center_of_mass_over_feet(),
             tilt: tilt(&frame.reading.orientation),

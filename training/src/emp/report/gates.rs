@@ -6,13 +6,13 @@ use anyhow::Result;
 use emp_models::{controller::Controller, emp::DangerGate, filters::EmpFilter};
 use emp_sim::{
     evaluation::{ExecutedFrame, Observer, Progress},
-    metrics::EpisodeSums,
+    metrics::Sample,
+    quantile::quantile_of,
     suite::Condition,
 };
 use serde::Serialize;
 
-use super::{Candidate, EmpRun, Outcome, Played, evaluation, sums};
-use crate::emp::falls::percentile;
+use super::{Candidate, EmpRun, HARD, Outcome, Part, Played, evaluation};
 
 /// Shares of safe frames that a gate lets pass.
 const PERCENTILES: [f64; 3] = [0.5, 0.9, 0.99];
@@ -56,12 +56,13 @@ pub(super) fn compare(
     let (Some(raw), Some(always)) = (played.first(), always) else {
         return Ok(Vec::new());
     };
+    let seed = run.set.seed();
     let mut rows = vec![GateRow {
         emp: candidate.name.clone(),
         gate: None,
         origin: "always on".to_owned(),
-        nominal: nominal(always, raw, run.seed),
-        hard: Outcome::new("hard suite", &always.hard(), &raw.hard(), run.seed),
+        nominal: nominal(always, raw, seed),
+        hard: Outcome::new(HARD, &always.hard(), &raw.hard(), seed),
         missed: 0,
         too_late: 0,
     }];
@@ -69,13 +70,13 @@ pub(super) fn compare(
         let (gated, too_late) = play(run, candidate, gate, progress)?;
         let pairs = gated.hard().into_iter().zip(always.hard());
         let is_missed =
-            |(gated, always): &(EpisodeSums, EpisodeSums)| gated.sums.suc < always.sums.suc;
+            |(gated, always): &(Sample, Sample)| gated.sums.sums.suc < always.sums.sums.suc;
         rows.push(GateRow {
             emp: candidate.name.clone(),
             gate: Some(gate),
             origin,
-            nominal: nominal(&gated, raw, run.seed),
-            hard: Outcome::new("hard suite", &gated.hard(), &raw.hard(), run.seed),
+            nominal: nominal(&gated, raw, seed),
+            hard: Outcome::new(HARD, &gated.hard(), &raw.hard(), seed),
             missed: pairs.filter(is_missed).count(),
             too_late,
         });
@@ -84,11 +85,7 @@ pub(super) fn compare(
 }
 
 fn nominal(played: &Played, raw: &Played, seed: u64) -> Outcome {
-    let of = |played: &Played| {
-        let mut conditions = played.conditions.iter();
-        let nominal = conditions.find(|(condition, _)| *condition == Condition::Nominal);
-        nominal.map_or_else(Vec::new, |(_, sums)| sums.clone())
-    };
+    let of = |played: &Played| played.samples(|part| part.condition == Condition::Nominal);
     Outcome::new(Condition::Nominal.name(), &of(played), &of(raw), seed)
 }
 
@@ -101,13 +98,22 @@ fn gates(
     let never = DangerGate::Regloss(f32::INFINITY);
     let mut safe = Regloss::default();
     let controller = gated(run, candidate, never);
-    evaluation(run, &controller, Condition::Nominal, &mut safe, progress)?;
+    for group in run.groups {
+        evaluation(
+            run,
+            &controller,
+            Condition::Nominal,
+            group,
+            &mut safe,
+            progress,
+        )?;
+    }
     let mut gates = vec![
         (candidate.emp.config().gate, "the checkpoint's".to_owned()),
         (DangerGate::PAPER, "the paper's".to_owned()),
     ];
     for share in PERCENTILES {
-        let limit = percentile(safe.0.clone(), share);
+        let limit = quantile_of(safe.0.clone(), share);
         let origin = format!("p{:.0} of nominal frames", 100.0 * share);
         gates.extend(limit.map(|limit| (DangerGate::Regloss(limit as f32), origin)));
     }
@@ -129,26 +135,29 @@ fn play(
     progress: &mut dyn Progress,
 ) -> Result<(Played, usize)> {
     let controller = gated(run, candidate, gate);
-    let mut conditions = Vec::new();
+    let mut parts = Vec::new();
     let mut too_late = 0;
     for condition in [Condition::Nominal].into_iter().chain(Condition::HARD) {
-        let mut openings = Openings::default();
-        let evaluation = evaluation(run, &controller, condition, &mut openings, progress)?;
-        if condition != Condition::Nominal {
-            let fallen = evaluation
-                .results
-                .iter()
-                .filter(|result| result.failure.is_some());
-            let late = fallen.filter(|result| openings.frames(result.episode) < TOO_LATE);
-            too_late += late.count();
+        for group in run.groups {
+            let mut openings = Openings::default();
+            let evaluation =
+                evaluation(run, &controller, condition, group, &mut openings, progress)?;
+            if condition != Condition::Nominal {
+                let fallen = evaluation
+                    .results
+                    .iter()
+                    .filter(|result| result.failure.is_some());
+                let late = fallen.filter(|result| openings.frames(result.episode) < TOO_LATE);
+                too_late += late.count();
+            }
+            parts.push(Part::new(condition, group, &evaluation));
         }
-        conditions.push((condition, sums(&evaluation)));
     }
     let played = Played {
         name: candidate.name.clone(),
         family: candidate.name.clone(),
         learned: true,
-        conditions,
+        parts,
     };
     Ok((played, too_late))
 }

@@ -18,16 +18,23 @@ use emp_models::{
 };
 use emp_sim::{
     Pool,
-    evaluation::{Evaluation, Observer, Progress, evaluate_observed},
-    goals::GoalClip,
-    metrics::{EpisodeSums, Interval, Metrics, failures_cut, paired_difference, summary},
+    evaluation::{EpisodeResult, Evaluation, Observer, Progress, evaluate_observed},
+    metrics::{
+        Interval, Metrics, Sample, failures, failures_cut, motions, paired_difference, summary,
+    },
     suite::Condition,
 };
 use serde::Serialize;
 
+use super::settings::{HindsightSettings, Preset, Remedy, Settings};
+use crate::sets::{Basis, ClipGroup, MotionSet};
+
 pub use frontier::draw;
 pub use gates::GateRow;
 pub use matched::{Match, Price};
+
+/// What the hard conditions together are called.
+const HARD: &str = "hard suite";
 
 /// Conditions beside the hard ones.
 const OTHERS: [Condition; 2] = [Condition::Nominal, Condition::Easy];
@@ -67,8 +74,16 @@ impl Family {
             ),
             family(
                 "velocity limit",
-                &each(&["3", "2", "1.4", "1"], "velocity-limit:limit"),
+                &each(&["4", "3", "2", "1.5", "1"], "velocity-limit:limit"),
             ),
+            family(
+                "velocity limit, waist and shoulders",
+                &each(
+                    &["4", "3", "2", "1.5", "1"],
+                    "velocity-limit:joints=waist+shoulder,limit",
+                ),
+            ),
+            family("the EMP's own remedies", &Self::remedies()),
             family(
                 "static clamp",
                 &each(&["0.03", "0.05", "0.06", "0.07"], "static-clamp:margin"),
@@ -81,6 +96,14 @@ impl Family {
                 ),
             ),
         ]
+    }
+}
+
+impl Family {
+    /// What the default EMP's training tries against falls, as plain filters.
+    fn remedies() -> Vec<String> {
+        let HindsightSettings { against_falls, .. } = Settings::preset(Preset::Default).hindsight;
+        against_falls.iter().map(Remedy::filter).collect()
     }
 }
 
@@ -98,10 +121,10 @@ pub struct EmpRun<'a> {
     pub pool: &'a Pool,
     /// The policy behind every filter.
     pub policy: &'a Arc<Policy>,
-    /// Motion.
-    pub clips: &'a [GoalClip],
-    /// Seed of loads, pushes and randomisation.
-    pub seed: u64,
+    /// Motion, kind by kind.
+    pub groups: &'a [ClipGroup],
+    /// What the motion is for.
+    pub set: MotionSet,
     /// EMPs.
     pub candidates: &'a [Candidate],
     /// What they have to beat.
@@ -115,10 +138,8 @@ pub struct EmpRun<'a> {
 pub struct EmpReport {
     /// Name of the robot.
     robot: String,
-    /// Clips under each condition.
-    clips: usize,
-    /// Seed of loads, pushes and randomisation.
-    seed: u64,
+    /// What it rests on.
+    basis: Basis,
     /// The policy alone, the EMPs, then each family from mild to strong.
     rows: Vec<Row>,
     /// Each EMP against each filter that needs no learning, over the hard conditions.
@@ -140,6 +161,8 @@ pub struct Row {
     learned: bool,
     /// All hard conditions together.
     hard: Outcome,
+    /// The same by the kind of motion.
+    groups: Vec<GroupOutcome>,
     /// Each condition by itself.
     conditions: Vec<Outcome>,
 }
@@ -151,6 +174,8 @@ pub struct Outcome {
     condition: &'static str,
     /// Number of episodes.
     episodes: usize,
+    /// Number of motions that they play: what the intervals rest on.
+    motions: usize,
     /// Number of those in which the robot fell.
     falls: usize,
     /// Share of the policy's own falls that are gone; none where it has none.
@@ -159,6 +184,16 @@ pub struct Outcome {
     metrics: Metrics<Interval>,
     /// Their difference from the policy's own, pair by pair.
     difference: Metrics<Interval>,
+}
+
+/// What came of the episodes on one kind of motion.
+#[derive(Clone, Debug, Serialize)]
+pub struct GroupOutcome {
+    /// The kind of motion.
+    name: &'static str,
+    /// What came of them.
+    #[serde(flatten)]
+    outcome: Outcome,
 }
 
 /// An EMP against a filter.
@@ -172,12 +207,20 @@ pub struct Duel {
     difference: Metrics<Interval>,
 }
 
-/// The episodes of one controller, condition by condition.
+/// The episodes of one controller.
 struct Played {
     name: String,
     family: String,
     learned: bool,
-    conditions: Vec<(Condition, Vec<EpisodeSums>)>,
+    /// Those of each condition and kind of motion.
+    parts: Vec<Part>,
+}
+
+/// The episodes of one condition and kind of motion.
+struct Part {
+    condition: Condition,
+    group: &'static str,
+    samples: Vec<Sample>,
 }
 
 /// Compares.
@@ -194,14 +237,13 @@ pub fn report(run: &EmpRun<'_>, progress: &mut dyn Progress) -> Result<EmpReport
         None => Vec::new(),
     };
     let raw = &played[0];
-    let rows: Vec<Row> = played.iter().map(|one| one.row(raw, run.seed)).collect();
+    let rows: Vec<Row> = played.iter().map(|one| one.row(raw, run)).collect();
     Ok(EmpReport {
         robot: run.policy.robot().name().to_owned(),
-        clips: run.clips.len(),
-        seed: run.seed,
+        basis: Basis::new(run.set, run.groups),
         matches: matched::matches(&rows),
         rows,
-        duels: duels(&played, run.seed),
+        duels: duels(&played, run.set.seed()),
         gates,
     })
 }
@@ -253,11 +295,12 @@ fn evaluation(
     run: &EmpRun<'_>,
     controller: &Controller,
     condition: Condition,
+    group: &ClipGroup,
     observer: &mut dyn Observer,
     progress: &mut dyn Progress,
 ) -> Result<Evaluation> {
-    let settings = condition.settings(run.policy.robot(), run.seed);
-    let clips = run.clips;
+    let settings = condition.settings(run.policy.robot(), run.set.seed());
+    let clips = &group.clips;
     let evaluation = evaluate_observed(run.pool, controller, clips, &settings, progress, observer)?;
     ensure!(
         evaluation.complete,
@@ -267,52 +310,76 @@ fn evaluation(
     Ok(evaluation)
 }
 
-fn sums(evaluation: &Evaluation) -> Vec<EpisodeSums> {
-    evaluation
-        .results
-        .iter()
-        .map(|result| result.sums)
-        .collect()
+impl Part {
+    fn new(condition: Condition, group: &ClipGroup, evaluation: &Evaluation) -> Self {
+        let samples = evaluation.results.iter().map(EpisodeResult::sample);
+        Self {
+            condition,
+            group: group.name,
+            samples: samples.collect(),
+        }
+    }
 }
 
 fn play(run: &EmpRun<'_>, contender: &Contender, progress: &mut dyn Progress) -> Result<Played> {
-    let conditions = OTHERS.into_iter().chain(Condition::HARD);
-    let play = |condition| {
-        let evaluation = evaluation(run, &contender.controller, condition, &mut (), progress)
-            .with_context(|| format!("evaluating {}", contender.name))?;
-        Ok((condition, sums(&evaluation)))
-    };
+    let mut parts = Vec::new();
+    for condition in OTHERS.into_iter().chain(Condition::HARD) {
+        for group in run.groups {
+            let controller = &contender.controller;
+            let evaluation = evaluation(run, controller, condition, group, &mut (), progress)
+                .with_context(|| format!("evaluating {}", contender.name))?;
+            parts.push(Part::new(condition, group, &evaluation));
+        }
+    }
     Ok(Played {
         name: contender.name.clone(),
         family: contender.family.clone(),
         learned: contender.learned,
-        conditions: conditions.map(play).collect::<Result<_>>()?,
+        parts,
     })
 }
 
 impl Played {
-    /// The episodes of all hard conditions.
-    fn hard(&self) -> Vec<EpisodeSums> {
-        let hard = self.conditions.iter();
-        hard.filter(|(condition, _)| Condition::HARD.contains(condition))
-            .flat_map(|(_, sums)| sums)
-            .copied()
-            .collect()
+    /// The episodes of the parts that are chosen.
+    fn samples(&self, is_chosen: impl Fn(&Part) -> bool) -> Vec<Sample> {
+        let parts = self.parts.iter().filter(|part| is_chosen(part));
+        parts.flat_map(|part| part.samples.clone()).collect()
     }
 
-    fn row(&self, raw: &Self, seed: u64) -> Row {
-        let pairs = self.conditions.iter().zip(&raw.conditions);
+    /// The episodes of all hard conditions.
+    fn hard(&self) -> Vec<Sample> {
+        self.samples(Part::is_hard)
+    }
+
+    fn row(&self, raw: &Self, run: &EmpRun<'_>) -> Row {
+        let outcome = |name: &'static str, is_chosen: &dyn Fn(&Part) -> bool| {
+            let [ours, raw] = [self, raw].map(|played| played.samples(is_chosen));
+            Outcome::new(name, &ours, &raw, run.set.seed())
+        };
+        let conditions = OTHERS.into_iter().chain(Condition::HARD);
         Row {
             name: self.name.clone(),
             family: self.family.clone(),
             learned: self.learned,
-            hard: Outcome::new("hard suite", &self.hard(), &raw.hard(), seed),
-            conditions: pairs
-                .map(|((condition, ours), (_, raw))| {
-                    Outcome::new(condition.name(), ours, raw, seed)
+            hard: outcome(HARD, &Part::is_hard),
+            groups: run
+                .groups
+                .iter()
+                .map(|group| GroupOutcome {
+                    name: group.name,
+                    outcome: outcome(HARD, &|part| part.is_hard() && part.group == group.name),
                 })
                 .collect(),
+            conditions: conditions
+                .map(|condition| outcome(condition.name(), &|part| part.condition == condition))
+                .collect(),
         }
+    }
+}
+
+impl Part {
+    fn is_hard(&self) -> bool {
+        Condition::HARD.contains(&self.condition)
     }
 }
 
@@ -324,11 +391,12 @@ impl Row {
 }
 
 impl Outcome {
-    fn new(condition: &'static str, ours: &[EpisodeSums], raw: &[EpisodeSums], seed: u64) -> Self {
+    fn new(condition: &'static str, ours: &[Sample], raw: &[Sample], seed: u64) -> Self {
         Self {
             condition,
             episodes: ours.len(),
-            falls: falls(ours),
+            motions: motions(ours),
+            falls: failures(ours),
             falls_cut: failures_cut(ours, raw, seed),
             metrics: summary(ours, seed),
             difference: paired_difference(ours, raw, seed),
@@ -339,12 +407,6 @@ impl Outcome {
     fn fallen(&self) -> f64 {
         self.falls as f64 / self.episodes.max(1) as f64
     }
-}
-
-fn falls(sums: &[EpisodeSums]) -> usize {
-    sums.iter()
-        .filter(|episode| episode.sums.suc == 0.0)
-        .count()
 }
 
 fn duels(played: &[Played], seed: u64) -> Vec<Duel> {

@@ -88,11 +88,22 @@ fn small_report() -> EmpReport {
             .map(str::to_owned)
             .to_vec(),
     }];
+    let mut clips = clips(robot);
+    let groups = [
+        ClipGroup {
+            name: ClipGroup::LIVELY,
+            clips: clips.split_off(1),
+        },
+        ClipGroup {
+            name: ClipGroup::PROCEDURAL,
+            clips,
+        },
+    ];
     let run = EmpRun {
         pool: &pool,
         policy: &policy,
-        clips: &clips(robot),
-        seed: 3,
+        groups: &groups,
+        set: MotionSet::Train,
         candidates: &candidates,
         families: &families,
         gates: Some(0),
@@ -115,7 +126,9 @@ fn every_controller_is_compared_on_the_same_episodes() {
     );
     let raw = &report.rows[0];
     assert_eq!(raw.conditions.len(), 8);
-    assert_eq!(raw.hard.episodes, 6 * 3);
+    assert_eq!((raw.hard.episodes, raw.hard.motions), (6 * 3, 3));
+    let by_group = raw.groups.iter().map(|group| group.outcome.episodes);
+    assert_eq!(by_group.collect::<Vec<_>>(), [6 * 2, 6]);
     assert_eq!(raw.hard.difference.mjp, Interval::default());
     assert_eq!(raw.hard.metrics.changed_share.mean, 0.0);
     for row in &report.rows[1..] {
@@ -161,6 +174,8 @@ fn every_controller_is_compared_on_the_same_episodes() {
     for part in [
         "| **small** | ",
         "| decoupled | 0 of 18 | – |",
+        "on the train set, seed 7: 2 clips of 2 motions (lively recordings), 1 clips of 1 motions (procedural)",
+        "| controller | lively recordings, 12 of 2 | procedural, 6 of 1 |",
         "### Falls by condition",
         "| **small** | amplitude-cut:factor=0.5 |",
         "### Danger gates of small",
@@ -221,5 +236,29 @@ fn how_long_a_gate_has_been_open_is_counted_anew_after_it_closed() {
     assert_eq!(
         [0, 1, 2, 3, 4].map(|episode| openings.frames(episode)),
         [3, 2, 0, 0, 0]
+    );
+}
+
+#[test]
+fn the_usual_filters_can_be_made_and_the_remedies_are_among_them() {
+    let policy = policy();
+    let families = Family::usual("shoulder_pitch=-1.2");
+    for member in families.iter().flat_map(|family| &family.members) {
+        Controller::by_name(member, &policy, None).unwrap();
+    }
+    let remedies = families
+        .iter()
+        .find(|family| family.name.contains("remedies"));
+    let joints = "joints=waist+shoulder_pitch+shoulder_roll";
+    let tamed =
+        |factor| format!("amplitude-cut:factor={factor},{joints}>velocity-limit:limit=3,{joints}");
+    assert_eq!(
+        remedies.unwrap().members,
+        [
+            format!("velocity-limit:limit=1.5,{joints}"),
+            tamed("0.8"),
+            tamed("0.6"),
+            tamed("0.4")
+        ]
     );
 }

@@ -5,18 +5,17 @@ use std::fmt;
 use emp_models::emp::DangerGate;
 use emp_sim::{metrics::Interval, suite::Condition};
 
-use super::{Duel, EmpReport, GateRow, Match, Outcome, Row};
+use super::{Duel, EmpReport, GateRow, GroupOutcome, Match, Outcome, Row};
 
 impl fmt::Display for EmpReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            robot, clips, seed, ..
-        } = self;
+        let Self { robot, basis, .. } = self;
         writeln!(
             f,
-            "{robot}, {clips} clips under each condition, seed {seed}; 95 % intervals over paired episodes.\n"
+            "{robot} on {basis}; 95 % intervals of paired differences over motions.\n"
         )?;
         self.write_hard(f)?;
+        self.write_groups(f)?;
         self.write_conditions(f)?;
         self.write_under(f, Condition::Nominal)?;
         self.write_under(f, Condition::Easy)?;
@@ -58,6 +57,30 @@ impl EmpReport {
                 difference.mbo.mean,
                 ratio(metrics.mus, difference.mus),
             )?;
+        }
+        writeln!(f)
+    }
+
+    fn write_groups(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Some(first) = self.rows.first() else {
+            return Ok(());
+        };
+        writeln!(
+            f,
+            "### Falls by the kind of motion, hard conditions together\n"
+        )?;
+        let heads = first.groups.iter().map(|GroupOutcome { name, outcome }| {
+            format!("{name}, {} of {}", outcome.episodes, outcome.motions)
+        });
+        let heads: Vec<String> = heads.collect();
+        writeln!(f, "| controller | {} |", heads.join(" | "))?;
+        writeln!(f, "|---|{}", "---|".repeat(heads.len()))?;
+        for row in &self.rows {
+            write!(f, "| {} |", named(row))?;
+            for GroupOutcome { outcome, .. } in &row.groups {
+                write!(f, " {}: {} |", outcome.falls, cut(outcome))?;
+            }
+            writeln!(f)?;
         }
         writeln!(f)
     }

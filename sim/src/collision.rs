@@ -194,16 +194,26 @@ mod tests {
         });
     }
 
-    /// Mean contact force over some control periods with the arms of these sides pressed on, N.
-    fn pressed_by(robot: &Robot, sides: &[&str]) -> f64 {
-        let (hanging, pressed) = (pose(robot, &[]), pressed(robot));
+    /// Arms that hang, those of these sides turned inward by `roll` (rad).
+    fn inward(robot: &Robot, sides: &[&str], roll: f32) -> Vec<f32> {
+        let angles = [
+            ("left_shoulder_roll", -roll),
+            ("right_shoulder_roll", roll),
+            ("elbow", 0.0),
+            ("shoulder_pitch", 0.0),
+        ];
+        let (hanging, pressed) = (pose(robot, &[]), pose(robot, &angles));
         let joints = robot.goal_joints().iter().zip(hanging.iter().zip(&pressed));
-        let goal: Vec<f32> = joints
+        joints
             .map(|(joint, (&hanging, &pressed))| {
                 let is_pressed = sides.iter().any(|side| joint.name.starts_with(side));
                 if is_pressed { pressed } else { hanging }
             })
-            .collect();
+            .collect()
+    }
+
+    /// Mean contact force over some control periods in a pose, N.
+    fn force(robot: &Robot, goal: &[f32]) -> f64 {
         let legs = robot.leg_joints().iter().map(|joint| joint.default as f32);
         let legs: Vec<f32> = legs.collect();
         let angles: Vec<f64> = goal.iter().chain(&legs).map(|&a| f64::from(a)).collect();
@@ -213,10 +223,7 @@ mod tests {
             lift: 0.0,
             parameters: BodyParameters::default(),
         });
-        let targets = Targets {
-            goal: &goal,
-            legs: &legs,
-        };
+        let targets = Targets { goal, legs: &legs };
         let forces = (0..10).map(|_| stage.step(&mut body, &targets).self_contact.force);
         forces.sum::<f64>() / 10.0
     }
@@ -224,15 +231,21 @@ mod tests {
     #[test]
     fn two_hands_that_press_from_both_sides_do_not_cancel() {
         let robot = crate::testing::emp27();
-        let [left, right] = [["left"], ["right"]].map(|side| pressed_by(&robot, &side));
-        let both = pressed_by(&robot, &["left", "right"]);
-        assert!(left > 5.0 && right > 5.0, "{left} {right}");
+        let mut collision = SelfCollision::new(&robot).unwrap();
+        // As far as the hands just press on the thighs.
+        let mut rolls = (0..40).map(|step| 0.01 * step as f32);
+        let roll = rolls.find(|&roll| {
+            let goal = inward(&robot, &["left"], roll);
+            collision.touches(&goal).unwrap()
+        });
+        let roll = roll.unwrap() + 0.02;
+        let [left, right, both] = [&["left"][..], &["right"], &["left", "right"]]
+            .map(|sides| force(&robot, &inward(&robot, sides, roll)));
+        assert!(left > 5.0 && right > 5.0, "{left} {right} at {roll}");
         // As vectors the two would add up to nearly nothing.
-        assert!(
-            (both / (left + right) - 1.0).abs() < 0.1,
-            "{both} {left} {right}"
-        );
-        assert_eq!(pressed_by(&robot, &[]), 0.0);
+        let sum = left + right;
+        assert!((both / sum - 1.0).abs() < 0.1, "{both}, {left} + {right}");
+        assert_eq!(force(&robot, &inward(&robot, &[], roll)), 0.0);
     }
 
     #[test]

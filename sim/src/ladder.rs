@@ -304,7 +304,9 @@ mod tests {
 
         let csv = ladder.csv();
         let lines: Vec<&str> = csv.lines().collect();
-        assert!(lines[0].starts_with("controller,axis,value,episodes,suc,suc_low,suc_high,mjp"));
+        assert!(
+            lines[0].starts_with("controller,axis,value,episodes,motions,suc,suc_low,suc_high,mjp")
+        );
         assert!(
             lines[4].starts_with("\"decoupled\",push,0.8,3,"),
             "{}",

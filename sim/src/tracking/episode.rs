@@ -8,7 +8,9 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::TrackingSettings;
-use crate::environment::{EndReason, EnvironmentConfig, EpisodeSetup, Kind, Randomization, Subject};
+use crate::environment::{
+    EndReason, EnvironmentConfig, EpisodeSetup, Kind, Randomization, Subject,
+};
 use crate::goals::{GoalClip, GoalJoint, Piece};
 use crate::pushes::{Kick, Pushes};
 use crate::ranges::within;

@@ -10,7 +10,11 @@ use emp_models::{
     observation::HistoryMap,
 };
 use emp_robot::Robot;
-use emp_sim::{Priority, Reading, evaluation::ExecutedFrame, goals::Source};
+use emp_sim::{
+    Priority, Reading,
+    evaluation::ExecutedFrame,
+    goals::{GoalClip, Source},
+};
 
 use super::*;
 

@@ -450,7 +450,7 @@ fn mistakes_in_a_specification_are_named() {
         ("low-pass:cutoff=2,cutoff=3", &["once", "cutoff=3"]),
         (
             "low-pass:cutof=2",
-            &["low-pass", "cutof", "cutoff or order"],
+            &["low-pass", "cutof", "cutoff, order or joints"],
         ),
         ("low-pass:cutoff=fast", &["cutoff", "0.01 to 25 Hz", "fast"]),
         ("low-pass:order=3", &["order", "1 or 2", "3"]),

@@ -240,8 +240,7 @@ impl Controller {
         let Some(filter) = &self.filter else {
             return Ok(settled);
         };
-        let legs = self.policy.robot().leg_joints().iter();
-        let legs: Vec<f32> = legs.map(|joint| joint.default as f32).collect();
+        let legs = self.policy.robot().default_legs();
         for _ in 0..SETTLING {
             let poses: Vec<Vec<f32>> = settled
                 .iter()

@@ -197,11 +197,7 @@ pub fn evaluate_observed(
             pushes: settings.pushes(&randomization),
             randomization,
             limits: EnvironmentConfig::default(),
-            default: robot
-                .goal_joints()
-                .iter()
-                .map(|joint| joint.default as f32)
-                .collect(),
+            default: robot.default_goal(),
         },
     };
     let episodes = settings.episodes.unwrap_or(clips.len());

@@ -9,11 +9,11 @@ use std::{path::Path, sync::Arc, time::Instant};
 use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
 use emp_models::{
-    CheckpointMetadata,
-    checkpoint::{self, write_atomically},
+    CheckpointMetadata, checkpoint,
     emp::{self, Emp, NETWORK_PREFIX},
     mlp::shipped_tensors,
 };
+use emp_motion::atomic;
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
@@ -429,7 +429,7 @@ pub fn train(
     if best != run.files.weights {
         let weights =
             std::fs::read(&best).with_context(|| format!("reading {}", best.display()))?;
-        write_atomically(&run.files.weights, &weights)
+        atomic::write(&run.files.weights, &weights)
             .with_context(|| format!("writing {}", run.files.weights.display()))?;
     }
     bar.finish();

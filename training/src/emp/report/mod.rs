@@ -26,7 +26,7 @@ use emp_sim::{
 };
 use serde::Serialize;
 
-use super::settings::{HindsightSettings, Preset, Remedy, Settings};
+use super::settings::{EmpSettings, HindsightSettings, Preset, Remedy};
 use crate::sets::{Basis, ClipGroup, MotionSet};
 
 pub use frontier::draw;
@@ -102,7 +102,8 @@ impl Family {
 impl Family {
     /// What the default EMP's training tries against falls, as plain filters.
     fn remedies() -> Vec<String> {
-        let HindsightSettings { against_falls, .. } = Settings::preset(Preset::Default).hindsight;
+        let HindsightSettings { against_falls, .. } =
+            EmpSettings::preset(Preset::Default).hindsight;
         against_falls.iter().map(Remedy::filter).collect()
     }
 }

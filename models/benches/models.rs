@@ -12,7 +12,7 @@ use emp_models::{
     linear::{self, Linear},
     mlp::Normalizer,
     policy::Policy,
-    retarget::{Effort, RetargetInput, Retargeter, Solver, Target},
+    retarget::{Effort, Mode, RetargetInput, Retargeter, Solver, Target},
 };
 use emp_motion::skills;
 use emp_robot::Robot;
@@ -280,8 +280,7 @@ fn retargeter(c: &mut Criterion) {
                 .take(batch)
                 .map(|frame| RetargetInput {
                     frame: frame.clone(),
-                    refine,
-                    previous: None,
+                    mode: if refine { Mode::Begin } else { Mode::Network },
                 })
                 .collect();
             let name = if refine {

@@ -59,6 +59,18 @@ impl CheckpointMetadata {
         Self::for_joints(kind, robot, robot.goal_joints())
     }
 
+    /// Metadata of a model of `kind` that answers `robot`'s goal joints and has no weights: its version stands for the
+    /// joints and their limits.
+    pub fn without_weights(kind: &str, robot: &Robot) -> Self {
+        let mut metadata = Self::for_goal_joints(kind, robot);
+        let described = format!(
+            "{} {:?} {:?}",
+            metadata.robot, metadata.joints, metadata.limits
+        );
+        metadata.sha256 = hex(&Sha256::digest(described.as_bytes()));
+        metadata
+    }
+
     /// Metadata of a model of `kind` that reads or answers these joints of `robot`.
     pub fn for_joints<'a>(
         kind: &str,
@@ -252,9 +264,9 @@ fn hash(file: &SafeTensors<'_>) -> String {
         ));
         hasher.update(tensor.data());
     }
-    hasher
-        .finalize()
-        .iter()
-        .map(|byte| format!("{byte:02x}"))
-        .collect()
+    hex(&hasher.finalize())
+}
+
+fn hex(digest: &[u8]) -> String {
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }

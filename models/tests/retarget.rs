@@ -11,8 +11,8 @@ use emp_models::{
     checkpoint::{self, Tensors},
     kinematics::ForwardKinematics,
     retarget::{
-        Effort, KIND, NetworkConfig, RetargetInput, RetargetNetwork, Retargeter, Smoother, Solver,
-        Target, features, retarget_clips,
+        Effort, KIND, Mode, NetworkConfig, RetargetInput, RetargetNetwork, Retargeter, Smoother,
+        Solver, Target, features, retarget_clips,
     },
 };
 use emp_motion::{Clip, skills};
@@ -265,8 +265,7 @@ fn shipped_weights_follow_the_medley() {
                 .into_iter()
                 .map(|frame| RetargetInput {
                     frame,
-                    refine,
-                    previous: None,
+                    mode: if refine { Mode::Begin } else { Mode::Network },
                 })
                 .collect();
             let outputs = retargeter.retarget(&inputs).unwrap();
@@ -296,8 +295,7 @@ fn a_batch_answers_as_single_frames_do() {
         .step_by(10)
         .map(|frame| RetargetInput {
             frame,
-            refine: true,
-            previous: None,
+            mode: Mode::Begin,
         })
         .collect();
     let batch = retargeter.retarget(&inputs).unwrap();
@@ -409,21 +407,21 @@ fn clips_are_answered_as_streams_are_and_alike_on_any_number_of_threads() {
             let clip = clip.resampled(robot.control_rate_hz());
             assert_eq!(rows.len(), clip.frames.len());
             let mut smoother = Smoother::new();
-            let mut previous = None;
-            let mut apart = 0;
+            let mut mode = Mode::Begin;
             for (frame, row) in clip.frames.iter().zip(rows) {
                 let input = RetargetInput {
                     frame: frame.clone(),
-                    refine: true,
-                    previous: previous.take(),
+                    mode,
                 };
-                let mut angles = retargeter.retarget(&[input]).unwrap().remove(0).angles;
-                previous = Some(angles.clone());
+                let output = retargeter.retarget(&[input]).unwrap().remove(0);
+                mode = Mode::Follow {
+                    memory: output.memory.unwrap(),
+                    seconds: 1.0 / robot.control_rate_hz(),
+                };
+                let mut angles = output.angles;
                 smoother.step(&mut angles);
-                apart += usize::from(angles.iter().zip(row).any(|(a, b)| (a - b).abs() > 1e-3));
+                assert_eq!(&angles, row, "{}", clip.name);
             }
-            // Where two codes tie, the batch's size may decide; the refined answer then differs for a while.
-            assert!(apart * 20 <= rows.len(), "{}: {apart} frames", clip.name);
         }
     }
 }

@@ -68,12 +68,18 @@ where
     })
 }
 
-/// Loads the shipped retargeting network from a weights file, each time anew.
+/// Loads a retargeter from its weights file, each time anew; without one it is inverse kinematics alone.
 pub(crate) fn retargeter_from(
-    weights: PathBuf,
+    weights: Option<PathBuf>,
     robot: Arc<Robot>,
-) -> impl FnMut() -> Result<Arc<Retargeter>, ModelError> + Send + 'static {
-    move || Retargeter::load(&weights, Arc::clone(&robot)).map(Arc::new)
+) -> impl Fn() -> Result<Arc<Retargeter>, ModelError> + Send + 'static {
+    move || {
+        let robot = Arc::clone(&robot);
+        match &weights {
+            Some(weights) => Retargeter::load(weights, robot).map(Arc::new),
+            None => Ok(Arc::new(Retargeter::without_network(robot))),
+        }
+    }
 }
 
 impl Backend for Arc<Retargeter> {

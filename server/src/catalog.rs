@@ -40,7 +40,7 @@ impl<I: Send + 'static, O: Send + 'static, M> Served<I, O, M> {
     }
 }
 
-/// A retargeting model; the network itself where it is the shipped one.
+/// A retargeting model; the retargeter itself where it is not a test's.
 pub(crate) type RetargetModel = Served<RetargetInput, RetargetOutput, Option<Arc<Retargeter>>>;
 
 /// A policy, alone and behind the robot's EMP, where it has one.
@@ -95,7 +95,8 @@ pub enum CatalogError {
 }
 
 impl Catalog {
-    /// Loads every robot that has weights, with each model whose weights are there; logs what it skips and why.
+    /// Loads every robot with each model whose weights are there, and a retargeter without weights where there are none; logs
+    /// what it skips and why.
     ///
     /// # Errors
     /// When the folders cannot be found or read, or nothing is left to serve.
@@ -137,6 +138,9 @@ impl Catalog {
         for (model, loaded) in loaded {
             let weights = file(model);
             match loaded {
+                Ok(()) if model == "retargeter" && matches!(weights.try_exists(), Ok(false)) => {
+                    tracing::info!(robot = robot.name(), weights = %weights.display(), "no trained retargeter: inverse kinematics alone is served");
+                }
                 Ok(()) => {
                     tracing::info!(robot = robot.name(), weights = %weights.display(), "model served");
                 }
@@ -149,23 +153,27 @@ impl Catalog {
         }
     }
 
+    /// Without weights, inverse kinematics alone answers; damaged weights are an error.
     fn load_retargeter(
         &mut self,
         weights: PathBuf,
         robot: &Arc<Robot>,
         batching: &BatchingSettings,
     ) -> Result<(), CatalogError> {
-        let name = format!("{}-retargeter", robot.name());
-        let model = Retargeter::load(&weights, Arc::clone(robot))
-            .map(Arc::new)
-            .map_err(failed(&name))?;
-        let card = wire::model_card(
+        let is_trained = !matches!(weights.try_exists(), Ok(false));
+        let suffix = if is_trained { "retargeter" } else { "ik" };
+        let name = format!("{}-{suffix}", robot.name());
+        let again = retargeter_from(is_trained.then_some(weights), Arc::clone(robot));
+        let model = again().map_err(failed(&name))?;
+        let mut card = wire::model_card(
             name,
             ModelKind::Retargeter,
             robot.goal_joints(),
             model.metadata(),
         );
-        let again = retargeter_from(weights, Arc::clone(robot));
+        if !is_trained {
+            card.weights_sha256.clear();
+        }
         let build = first_then(Arc::clone(&model), again);
         let served = serve(card, robot, batching, build, Some(model))?;
         insert(&mut self.robots, &mut self.retargeters, served);

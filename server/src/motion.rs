@@ -7,13 +7,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use emp_models::retarget::RetargetInput;
+use emp_models::retarget::{Memory, Mode, RetargetInput};
 use emp_proto::v1::{
     FilterGoalRequest, FilterGoalResponse, FrameHeader, RetargetRequest, RetargetResponse,
     StepPolicyRequest, StepPolicyResponse, StreamFilterGoalRequest, StreamFilterGoalResponse,
     StreamPolicyRequest, StreamPolicyResponse, StreamRetargetRequest, StreamRetargetResponse,
     TeleoperateRequest, TeleoperateResponse, motion_service_server::MotionService,
 };
+use emp_robot::Robot;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
@@ -81,6 +82,7 @@ impl Motion {
             model_version,
             refine,
             pose,
+            previous_joint_angles,
         } = request.into_inner();
         let model = self
             .catalog
@@ -88,8 +90,7 @@ impl Motion {
         let frame = pose::read(pose.as_ref())?;
         let input = RetargetInput {
             frame,
-            refine,
-            previous: None,
+            mode: retarget_mode(&model.robot, refine, &previous_joint_angles)?,
         };
         let answer = due.compute(&model.batcher, input, header.as_ref()).await?;
         let timing = wire::timing(&answer);
@@ -217,6 +218,38 @@ impl Motion {
             _permit: permit,
         })
     }
+}
+
+/// How a pose that stands alone is answered, or one after the previous answer.
+fn retarget_mode(robot: &Robot, refine: bool, previous: &[f32]) -> Result<Mode, FieldError> {
+    if previous.is_empty() {
+        return Ok(if refine { Mode::Begin } else { Mode::Network });
+    }
+    let field = "previous_joint_angles";
+    if !refine {
+        return Err(FieldError::new(
+            field,
+            "expected none without `refine`: only a refined answer follows from the one before",
+        ));
+    }
+    let joints = robot.goal_joints();
+    if previous.len() != joints.len() {
+        let (found, expected) = (previous.len(), joints.len());
+        return Err(FieldError::new(
+            field,
+            format!("expected {expected} angles, one for each goal joint, got {found}"),
+        ));
+    }
+    if let Some(i) = previous.iter().position(|angle| !angle.is_finite()) {
+        return Err(FieldError::new(
+            format!("{field}[{i}]"),
+            format!("expected a finite angle, got {}", previous[i]),
+        ));
+    }
+    Ok(Mode::Follow {
+        memory: Box::new(Memory::after(robot, previous)),
+        seconds: 1.0 / robot.control_rate_hz(),
+    })
 }
 
 /// When a unary call's answer is due.

@@ -133,6 +133,7 @@ impl Backend for FakeModel {
                 angles: vec![expected(&input.frame); self.joints],
                 direction_error: 0.0,
                 at_limit: Vec::new(),
+                memory: None,
             })
             .collect())
     }

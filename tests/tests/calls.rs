@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 use emp_client::{Client, ClientError};
-use emp_models::retarget::{RetargetInput, Retargeter};
-use emp_proto::v1::{FrameHeader, HumanPose, Position, RetargetRequest};
+use emp_models::retarget::{Mode, RetargetInput, Retargeter};
+use emp_motion::KeyNodeFrame;
+use emp_proto::v1::{self, FrameHeader, HumanPose, Position, RetargetRequest};
 use emp_server::Settings;
 use emp_tests::{
     TestServer, emp27,
@@ -57,8 +58,7 @@ async fn real_weights_answer_as_in_process_and_batches_as_single() -> anyhow::Re
             let answer = within("an answer", call).await???;
             let input = RetargetInput {
                 frame: pose.clone(),
-                refine,
-                previous: None,
+                mode: if refine { Mode::Begin } else { Mode::Network },
             };
             let alone = model.retarget(&[input])?.remove(0);
             assert_eq!(answer.joint_angles.len(), alone.angles.len());
@@ -162,6 +162,29 @@ async fn wrong_fields_are_refused_by_name() -> anyhow::Result<()> {
         ),
         ("pose", request(None)),
         (
+            "previous_joint_angles",
+            RetargetRequest {
+                refine: true,
+                previous_joint_angles: vec![0.0; 3],
+                ..request(Some(good_pose()))
+            },
+        ),
+        (
+            "previous_joint_angles",
+            RetargetRequest {
+                previous_joint_angles: vec![0.0; 15],
+                ..request(Some(good_pose()))
+            },
+        ),
+        (
+            "previous_joint_angles[14]",
+            RetargetRequest {
+                refine: true,
+                previous_joint_angles: [vec![0.0; 14], vec![f32::NAN]].concat(),
+                ..request(Some(good_pose()))
+            },
+        ),
+        (
             "pose.left_wrist",
             request(Some(HumanPose {
                 left_wrist: None,
@@ -209,6 +232,60 @@ async fn wrong_fields_are_refused_by_name() -> anyhow::Result<()> {
         answer.result.expect("a result").joint_angles,
         [fake::expected(&fake::pose(0.1)); 15]
     );
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_robot_without_weights_is_served_by_inverse_kinematics() -> anyhow::Result<()> {
+    let weights = tempfile::tempdir()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let client = Client::connect(&server.url()).await?;
+    let model = client.model("emp27-ik").await?;
+    assert_eq!(model.kind(), v1::ModelKind::Retargeter);
+    assert_eq!(model.version.len(), 12);
+    assert!(model.weights_sha256.is_empty(), "{model:?}");
+    for refine in [false, true] {
+        let answer = client.retarget("emp27", &fake::pose(0.1), refine).await?;
+        assert!(answer.direction_error < 0.01, "{answer:?}");
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_call_follows_from_the_previous_answer() -> anyhow::Result<()> {
+    let server = TestServer::start_real()?;
+    let mut client = server.raw_client().await?;
+    let ask = |pose: KeyNodeFrame, previous: &[f32]| RetargetRequest {
+        refine: true,
+        previous_joint_angles: previous.to_vec(),
+        ..request(Some(raw::pose(&pose)))
+    };
+    let angles = |response: tonic::Response<v1::RetargetResponse>| {
+        response
+            .into_inner()
+            .result
+            .unwrap_or_default()
+            .joint_angles
+    };
+    let first = angles(client.retarget(ask(fake::pose(0.0), &[])).await?);
+    let robot = emp27()?;
+    // The person stands still: the robot comes from far away at a bounded speed, and stays.
+    let mut previous: Vec<f32> = first.iter().map(|angle| angle + 0.3).collect();
+    for _ in 0..100 {
+        let next = angles(client.retarget(ask(fake::pose(0.0), &previous)).await?);
+        for ((before, after), joint) in previous.iter().zip(&next).zip(robot.goal_joints()) {
+            let step = f64::from((after - before).abs());
+            assert!(
+                step <= joint.velocity_limit / robot.control_rate_hz() + 1e-6,
+                "{}",
+                joint.name
+            );
+        }
+        previous = next;
+    }
+    for (there, first) in previous.iter().zip(&first) {
+        assert!((there - first).abs() < 0.02, "{there} {first}");
+    }
     Ok(())
 }
 

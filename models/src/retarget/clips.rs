@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use emp_motion::Clip;
 
-use super::{Retargeter, Smoother, Solver, Target, refine};
+use super::{Retargeter, Smoother, Solver, Target};
 use crate::ModelError;
 
 /// Frames that the network answers at once.
@@ -15,8 +15,8 @@ pub type GoalRows = Vec<Vec<f32>>;
 
 /// Retargets clips of any frame rate to goal angles at the robot's control rate, clip by clip in order.
 ///
-/// Each clip is answered as a stream of its own: the network, refinement from the previous answer where that is nearer,
-/// and [`Smoother`]. Clips are dealt to `threads` threads (at least one); a clip's answer depends on that clip alone.
+/// Each clip is answered as a live stream with refinement and smoothing is: [`Solver::begin`], [`Solver::follow`] and
+/// [`Smoother`]. Clips are dealt to `threads` threads (at least one); a clip's answer depends on that clip alone.
 ///
 /// # Errors
 /// [`ModelError::Clip`] for the first clip that has a frame which is no pose; when the tensor library fails.
@@ -55,12 +55,15 @@ pub fn retarget_clips(
 }
 
 /// The network's own answers to a clip of any frame rate, at the robot's control rate: what a live stream without refinement
-/// and smoothing gives, jumps between codes included.
+/// and smoothing gives, jumps between codes included. A retargeter without a network refines always.
 ///
 /// # Errors
 /// [`ModelError::Clip`] for a frame that is no pose; when the tensor library fails.
 pub fn predict_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {
     check(clip)?;
+    if !retargeter.has_network() {
+        return follow_clip(retargeter, clip);
+    }
     let clip = clip.resampled(retargeter.robot().control_rate_hz());
     let joints = retargeter.robot().goal_joints().len();
     let mut rows = GoalRows::with_capacity(clip.frames.len());
@@ -81,24 +84,30 @@ fn check(clip: &Clip) -> Result<(), ModelError> {
 }
 
 fn retarget_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {
+    let mut rows = follow_clip(retargeter, clip)?;
+    let mut smoother = Smoother::new();
+    for row in &mut rows {
+        smoother.step(row);
+    }
+    Ok(rows)
+}
+
+/// The refined stream before smoothing.
+fn follow_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {
     let robot = retargeter.robot();
     let clip = clip.resampled(robot.control_rate_hz());
-    let joints = robot.goal_joints().len();
+    let period = 1.0 / robot.control_rate_hz();
     let mut solver = Solver::new(robot);
-    let mut smoother = Smoother::new();
-    let mut previous: Option<Vec<f32>> = None;
+    let mut memory = None;
     let mut rows = GoalRows::with_capacity(clip.frames.len());
-    for frames in clip.frames.chunks(BATCH) {
-        let targets: Vec<Target> = frames.iter().map(Target::new).collect();
-        let (answers, _) = retargeter.predict(&targets)?;
-        for (target, answer) in targets.iter().zip(answers.chunks(joints)) {
-            let mut angles: Vec<f64> = answer.iter().map(|&angle| f64::from(angle)).collect();
-            refine(&mut solver, target, &mut angles, previous.as_deref());
-            let mut row: Vec<f32> = angles.iter().map(|&angle| angle as f32).collect();
-            previous = Some(row.clone());
-            smoother.step(&mut row);
-            rows.push(row);
-        }
+    for frame in &clip.frames {
+        let target = Target::new(frame);
+        let next = match memory.take() {
+            Some(memory) => solver.follow(&target, memory, period),
+            None => solver.begin(&target, &retargeter.starts(&target)?),
+        };
+        rows.push(next.angles());
+        memory = Some(next);
     }
     Ok(rows)
 }

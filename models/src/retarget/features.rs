@@ -4,6 +4,8 @@ use candle_core::{Device, Tensor};
 use emp_motion::{KEY_NODES, KeyNode, KeyNodeFrame, Side};
 use nalgebra::{Matrix3, Vector2, Vector3};
 
+use super::angles::{angle_between, turn_between};
+
 /// The arm bones in the order of [`Target::bones`]: left upper arm, left forearm, right upper arm, right forearm.
 pub const BONES: [(KeyNode, KeyNode); 4] = [
     (KeyNode::LeftShoulder, KeyNode::LeftElbow),
@@ -69,6 +71,35 @@ impl Target {
             wrists: frame
                 .wrist_rotations
                 .map(|wrist| wrist.map(|wrist| wrist.matrix().cast())),
+        }
+    }
+
+    /// How far the left and the right arm turn on the way to `after`, radians: the most of upper arm, forearm and hand (where
+    /// both poses have it).
+    pub fn arm_turns(&self, after: &Self) -> [f64; 2] {
+        std::array::from_fn(|side| {
+            let bone = |i: usize| angle_between(&self.bones[i], &after.bones[i]);
+            let hand = match (&self.wrists[side], &after.wrists[side]) {
+                (Some(before), Some(after)) => turn_between(before, after),
+                _ => 0.0,
+            };
+            bone(2 * side).max(bone(2 * side + 1)).max(hand)
+        })
+    }
+
+    /// The same pose in the mirror between left and right.
+    pub fn mirrored(&self) -> Self {
+        let flip = Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, 1.0));
+        let [left_upper, left_fore, right_upper, right_fore] = self.bones.map(|bone| flip * bone);
+        // A reflection of a rotation is none: the second column, which is made of the others, turns round.
+        let [left, right] = self
+            .wrists
+            .map(|wrist| wrist.map(|wrist| flip * wrist * flip));
+        Self {
+            bones: [right_upper, right_fore, left_upper, left_fore],
+            // The line is from right to left, which change places.
+            shoulder_line: Vector2::new(-self.shoulder_line.x, self.shoulder_line.y),
+            wrists: [right, left],
         }
     }
 

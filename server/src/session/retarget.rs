@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use emp_models::retarget::{RetargetInput, RetargetOutput, Retargeter, Smoother};
+use emp_models::retarget::{Memory, Mode, RetargetInput, RetargetOutput, Retargeter, Smoother};
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{
     DroppedFrame, FrameHeader, RetargetFrame, RetargetedFrame, StreamRetargetConfig,
@@ -24,8 +24,8 @@ pub(crate) struct RetargetStream {
     model: Arc<RetargetModel>,
     refine: bool,
     smoother: Option<Smoother>,
-    /// The last refined answer, before smoothing.
-    previous: Option<Vec<f32>>,
+    /// What the next refined answer starts from.
+    memory: Option<Box<Memory>>,
 }
 
 fn response(message: Response) -> StreamRetargetResponse {
@@ -71,7 +71,7 @@ impl Kind for RetargetStream {
             model: Arc::clone(model),
             refine: config.refine,
             smoother: config.smoothing.then(Smoother::new),
-            previous: None,
+            memory: None,
         })
     }
 
@@ -96,8 +96,14 @@ impl Kind for RetargetStream {
     fn input(&mut self, frame: &KeyNodeFrame) -> RetargetInput {
         RetargetInput {
             frame: frame.clone(),
-            refine: self.refine,
-            previous: self.previous.clone(),
+            mode: match &self.memory {
+                _ if !self.refine => Mode::Network,
+                None => Mode::Begin,
+                Some(memory) => Mode::Follow {
+                    memory: memory.clone(),
+                    seconds: 1.0 / self.model.robot.control_rate_hz(),
+                },
+            },
         }
     }
 
@@ -108,9 +114,7 @@ impl Kind for RetargetStream {
     ) -> StreamRetargetResponse {
         let timing = wire::timing(&answer);
         let mut angles = answer.output.angles;
-        if self.refine {
-            self.previous = Some(angles.clone());
-        }
+        self.memory = answer.output.memory;
         if let Some(smoother) = &mut self.smoother {
             smoother.step(&mut angles);
         }

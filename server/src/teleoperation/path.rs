@@ -8,7 +8,7 @@ use std::{
 use emp_models::{
     controller::ControllerState,
     guard::{ExecutionGuard, GoalGuard, GoalInput, GoalPhase, GuardSettings, RampCause},
-    retarget::{RetargetInput, RetargetOutput, Smoother},
+    retarget::{Memory, Mode, RetargetInput, RetargetOutput, Smoother},
 };
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{DroppedFrame, FrameHeader, PoseReport, TeleoperatedFrame, Timing};
@@ -205,6 +205,8 @@ struct Person {
     seen: Option<Arc<NewestPose>>,
     /// The last answer of the retargeter, rad, and when its pose arrived.
     retargeted: Option<(Vec<f32>, Instant)>,
+    /// What the next refined answer starts from.
+    memory: Option<Box<Memory>>,
     direction_error: f32,
     smoother: Smoother,
     /// The last answer after smoothing, rad.
@@ -236,14 +238,18 @@ impl Person {
         let before = self.seen.replace(Arc::clone(newest));
         let is_same_operator = before.is_some_and(|before| before.operator == newest.operator);
         let Retargeting { model, refine, .. } = &*newest.retargeting;
-        let previous = self
-            .retargeted
-            .as_ref()
-            .filter(|_| *refine && is_same_operator);
+        let memory = self.memory.clone().filter(|_| is_same_operator);
+        let before = self.retargeted.as_ref().map(|(_, arrived)| *arrived);
         let input = RetargetInput {
             frame: newest.frame.clone(),
-            refine: *refine,
-            previous: previous.map(|(angles, _)| angles.clone()),
+            mode: match (memory, before) {
+                _ if !*refine => Mode::Network,
+                (Some(memory), Some(before)) => Mode::Follow {
+                    memory,
+                    seconds: between(before, newest.arrived, model.robot.control_rate_hz()),
+                },
+                _ => Mode::Begin,
+            },
         };
         let deadline = deadline::sooner(deadline, newest.deadline);
         let answer = compute(&model.batcher, input, deadline).await?;
@@ -251,8 +257,10 @@ impl Person {
         let RetargetOutput {
             angles,
             direction_error,
+            memory,
             ..
         } = answer.output;
+        self.memory = memory;
         self.retargeted = Some((angles, newest.arrived));
         self.direction_error = direction_error;
         Ok(timing)
@@ -278,6 +286,14 @@ impl Person {
         let (_, arrived) = self.retargeted.as_ref()?;
         Some(now.saturating_duration_since(*arrived))
     }
+}
+
+/// Time between the arrivals of two poses, seconds: at least half a control period, for the network may deliver two at
+/// once, and at most a fifth of a second.
+fn between(before: Instant, after: Instant, control_rate_hz: f64) -> f64 {
+    const LONGEST: f64 = 0.2;
+    let seconds = after.saturating_duration_since(before).as_secs_f64();
+    seconds.clamp(0.5 / control_rate_hz, LONGEST)
 }
 
 /// Brings one item to its model.

@@ -6,10 +6,7 @@ use anyhow::{Context as _, Result};
 use clap::Args;
 use emp_models::retarget::Retargeter;
 use emp_motion::atomic;
-use emp_training::{
-    retargeter::{data, report},
-    run,
-};
+use emp_training::{retargeter::report, run};
 
 use super::arguments::{RobotArguments, retargeter_weights};
 
@@ -18,7 +15,8 @@ use super::arguments::{RobotArguments, retargeter_weights};
 pub(crate) struct Arguments {
     #[command(flatten)]
     robot: RobotArguments,
-    /// Folders (or files) of recorded motion; without any, a library of procedural skills.
+    /// Folders (or files) of recorded motion, each folder with motion under them a set of its own; without any, a library
+    /// of procedural skills that no network was trained on.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     motions: Vec<PathBuf>,
     /// The weights [default: models/weights/ROBOT-retargeter.safetensors].
@@ -37,18 +35,14 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     let robot = arguments.robot.load()?;
     let weights = retargeter_weights(arguments.weights.as_ref(), &robot);
     let retargeter = Retargeter::load(&weights, robot)?;
-    let clips = if arguments.motions.is_empty() {
-        let library = emp_motion::skills::library(1, 60);
-        library
-            .iter()
-            .map(|clip| clip.resampled(data::RATE))
-            .collect()
+    let sets = if arguments.motions.is_empty() {
+        vec![report::held_out(&retargeter)?]
     } else {
-        data::load_clips(&arguments.motions)?
+        report::load_sets(&arguments.motions, retargeter.robot().control_rate_hz())?
     };
     let bar = run::spinner();
-    let report = report::report(&retargeter, &clips, |method| {
-        bar.set_message(method.to_owned());
+    let report = report::report(&retargeter, sets, |what| {
+        bar.set_message(what.to_owned());
     })?;
     bar.finish_and_clear();
     let json = serde_json::to_string_pretty(&report)?;

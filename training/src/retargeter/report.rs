@@ -369,7 +369,7 @@ fn measure(
     for ((clip, targets), track) in set.clips.iter().zip(targets).zip(tracks) {
         let played = Played::new(&mut solver, targets, track, robot.control_rate_hz());
         let mut of_clip = Vec::with_capacity(4 * track.len());
-        let mut arms_at_limit = 0;
+        let mut arms_at_limit = 0usize;
         for (angles, target) in track.iter().zip(targets) {
             of_clip.extend(solver.bone_errors(target, angles).map(f64::to_degrees));
             let errors = solver.wrist_errors(target, angles);
@@ -388,7 +388,7 @@ fn measure(
             name: clip.name.clone(),
             frames: track.len(),
             direction_deg: Spread::of(of_clip.clone()).ok_or_else(nothing)?,
-            arm_limit_share: f64::from(arms_at_limit) / track.len() as f64,
+            arm_limit_share: arms_at_limit as f64 / track.len() as f64,
             spins: spinning,
         });
         directions.extend(of_clip);

@@ -270,7 +270,10 @@ async fn a_call_follows_from_the_previous_answer() -> anyhow::Result<()> {
     let first = angles(client.retarget(ask(fake::pose(0.0), &[])).await?);
     let robot = emp27()?;
     // The person stands still: the robot comes from far away at a bounded speed, and stays.
-    let mut previous: Vec<f32> = first.iter().map(|angle| angle + 0.3).collect();
+    let joints = first.iter().zip(robot.goal_joints());
+    let mut previous: Vec<f32> = joints
+        .map(|(angle, joint)| (angle + 0.3).min(joint.range[1] as f32))
+        .collect();
     for _ in 0..100 {
         let next = angles(client.retarget(ask(fake::pose(0.0), &previous)).await?);
         for ((before, after), joint) in previous.iter().zip(&next).zip(robot.goal_joints()) {

@@ -3,12 +3,14 @@
 use std::{path::PathBuf, str::FromStr};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use emp_motion::{BodyJoint, ReadOptions, UpAxis, parse_unit};
 
 /// Sends recorded human motion to an emp-server: for a robot's joint targets, to drive a robot in a session, or to have a
 /// controller evaluated there.
 ///
 /// Start a server with `emp-server`; it prints the address that it listens on. Then, for example:
 ///
+///   emp inspect walk.bvh
 ///   emp robots
 ///   emp retarget walk.bvh --robot emp27 --refine --smooth --out joints.csv
 ///   emp retarget walk.bvh --robot emp27 --realtime --out joints.csv
@@ -40,6 +42,11 @@ pub(crate) struct Arguments {
 
 #[derive(Subcommand)]
 pub(crate) enum Command {
+    /// Print what a motion file is taken for; needs no server
+    ///
+    /// Format, naming scheme, frames, rate, unit, up axis, handedness, height, the joint of each key node, hands, and warnings
+    /// about what may be misread.
+    Inspect(Inspect),
     /// Retarget a motion file to a robot
     ///
     /// The motion is resampled to the robot's control rate and streamed. The result is a CSV table: `time_s`, then one
@@ -58,7 +65,8 @@ pub(crate) enum Command {
     /// and MUS are printed with 95 % intervals, recorded and procedural motion apart, beside how fast and how wide the
     /// goals moved; then every clip that failed, with the time and the reason. The same request gives the same numbers.
     ///
-    /// After Ctrl-C, or when the server is lost, what finished is reported and written.
+    /// A file that cannot be read is left out and said; the result counts them. After Ctrl-C, or when the server is lost, what
+    /// finished is reported and written.
     Evaluate(Evaluate),
     /// Send a motion file as the operator of a teleoperation session
     ///
@@ -77,10 +85,67 @@ pub(crate) enum Command {
     Models,
 }
 
+/// What to inspect.
+#[derive(Args)]
+pub(crate) struct Inspect {
+    /// Motion file: BVH (.bvh), SMPL family or key nodes (.npz), Xsens (.mvnx), markers (.c3d)
+    pub(crate) file: PathBuf,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}
+
+/// What a motion file does not say, or says wrongly.
+#[derive(Args)]
+#[command(next_help_heading = "Reading the motion")]
+pub(crate) struct Reading {
+    /// Frames a second [default: the file's]
+    #[arg(long, value_name = "HZ")]
+    pub(crate) fps: Option<f64>,
+    /// Unit of length: m, cm, mm, in, ft or a number of metres [default: by the arms' length]
+    #[arg(long, value_name = "UNIT", value_parser = parse_unit)]
+    pub(crate) unit: Option<f64>,
+    /// Axis that points up: x, y, z, -x, -y or -z [default: by the body and the floor]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
+    pub(crate) up: Option<UpAxis>,
+    /// The file's joint (or marker) for a key node, a hip (left_hip, right_hip): left_elbow=NAME; may be repeated
+    #[arg(long, value_name = "NODE=NAME", value_parser = mapping)]
+    pub(crate) map: Vec<(BodyJoint, String)>,
+    /// Whether the file holds the mirror image of its person [default: by feet, knees, thumbs and elbows]
+    #[arg(long, value_name = "yes|no", num_args = 0..=1, default_missing_value = "yes", value_parser = yes_or_no)]
+    pub(crate) mirror: Option<bool>,
+}
+
+impl Reading {
+    pub(crate) fn options(&self) -> ReadOptions {
+        ReadOptions {
+            fps: self.fps,
+            metres_per_unit: self.unit,
+            up: self.up,
+            mirror: self.mirror,
+            map: self.map.clone(),
+        }
+    }
+}
+
+fn mapping(text: &str) -> Result<(BodyJoint, String), String> {
+    let (joint, name) = text
+        .split_once('=')
+        .ok_or_else(|| "expected NODE=NAME, for example left_elbow=LeftForeArm".to_owned())?;
+    Ok((joint.parse()?, name.to_owned()))
+}
+
+fn yes_or_no(text: &str) -> Result<bool, String> {
+    match text {
+        "yes" => Ok(true),
+        "no" => Ok(false),
+        _ => Err("expected yes or no".to_owned()),
+    }
+}
+
 /// What to retarget, for whom, and how.
 #[derive(Args)]
 pub(crate) struct Retarget {
-    /// Motion file: BVH (.bvh), AMASS (.npz) or key nodes (.npz)
+    /// Motion file: BVH (.bvh), SMPL family or key nodes (.npz), Xsens (.mvnx), markers (.c3d)
     pub(crate) file: PathBuf,
     /// Name of the robot, as `emp robots` lists it
     #[arg(long, value_name = "NAME")]
@@ -98,12 +163,14 @@ pub(crate) struct Retarget {
     /// Smooth the joint angles over time, at the cost of at most one frame of delay
     #[arg(long)]
     pub(crate) smooth: bool,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
 }
 
 /// What to send, and to which session.
 #[derive(Args)]
 pub(crate) struct Operate {
-    /// Motion file: BVH (.bvh), AMASS (.npz) or key nodes (.npz)
+    /// Motion file: BVH (.bvh), SMPL family or key nodes (.npz), Xsens (.mvnx), markers (.c3d)
     pub(crate) file: PathBuf,
     /// Name of the robot, as `emp robots` lists it
     #[arg(long, value_name = "NAME")]
@@ -114,6 +181,8 @@ pub(crate) struct Operate {
     /// When the robot's Executable Motion Prior changes goals [default: as the session has it]
     #[arg(long, value_enum)]
     pub(crate) emp_mode: Option<EmpMode>,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
 }
 
 /// Which session to listen to.
@@ -161,7 +230,7 @@ pub(crate) struct Evaluate {
     /// `NAME:key=value,…`; an unknown one is answered with those that there are
     #[arg(long, value_name = "NAME", default_value = "decoupled")]
     pub(crate) controller: String,
-    /// Folders (searched recursively) or files of recorded motion: BVH, AMASS, key nodes
+    /// Folders (searched recursively) or files of recorded motion, as `emp inspect` reads them
     #[arg(long, value_name = "DIR", num_args = 1.., required_unless_present = "procedural")]
     pub(crate) motions: Vec<PathBuf>,
     /// Number of procedural motions, 3 to 20 s each, drawn from the seed
@@ -197,6 +266,8 @@ pub(crate) struct Evaluate {
     /// Where to write one row an episode
     #[arg(long, value_name = "FILE")]
     pub(crate) csv: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
 }
 
 /// How much simulated robots differ from the model.
@@ -238,6 +309,40 @@ mod tests {
     #[test]
     fn the_command_line_is_sound() {
         Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn a_motion_can_be_read_otherwise() {
+        let line = "emp inspect a.bvh --fps 30 --unit cm --up -y --map left_elbow=Elle --map right_hip=Hüfte --mirror";
+        let arguments = Arguments::try_parse_from(line.split(' ')).expect("valid");
+        let Command::Inspect(command) = arguments.command else {
+            panic!("another command");
+        };
+        let options = command.reading.options();
+        assert_eq!(
+            (
+                options.fps,
+                options.metres_per_unit,
+                options.up,
+                options.mirror
+            ),
+            (Some(30.0), Some(0.01), Some(UpAxis::MinusY), Some(true))
+        );
+        assert_eq!(
+            options.map[1],
+            ("right_hip".parse().expect("a joint"), "Hüfte".to_owned())
+        );
+        for bad in [
+            "--unit yard",
+            "--up w",
+            "--map elbow=x",
+            "--map left_elbow",
+            "--mirror maybe",
+            "--unit -1",
+        ] {
+            let line = format!("emp inspect a.bvh {bad}");
+            assert!(Arguments::try_parse_from(line.split(' ')).is_err(), "{bad}");
+        }
     }
 
     #[test]

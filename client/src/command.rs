@@ -3,23 +3,38 @@
 use std::{path::Path, time::Duration};
 
 use emp_client::Client;
-use emp_motion::Clip;
+use emp_motion::{Clip, ReadOptions, Understanding};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 /// The exit code after Ctrl-C.
 pub(crate) const INTERRUPTED: u8 = 130;
 
-/// A recorded motion at a robot's control rate, and that rate, Hz.
-pub(crate) async fn motion(
+/// A recorded motion at a robot's control rate, and that rate, Hz. What the file was taken for is said on standard error.
+pub(crate) async fn recording(
     client: &Client,
     file: &Path,
+    options: ReadOptions,
     robot: &str,
 ) -> anyhow::Result<(Clip, f64)> {
-    let file = file.to_owned();
+    let path = file.to_owned();
     // Large recordings take seconds to parse.
-    let clip = tokio::task::spawn_blocking(move || emp_motion::load(&file)).await??;
+    let read = tokio::task::spawn_blocking(move || emp_motion::read(&path, &options));
+    let reading = read.await??;
+    say_understood(file, &reading.understanding);
     let rate = client.robot(robot).await?.control_rate;
-    Ok((clip.resampled(rate), rate))
+    Ok((reading.clip.resampled(rate)?, rate))
+}
+
+/// Says in two lines, and one a warning, what a file was taken for.
+pub(crate) fn say_understood(file: &Path, understood: &Understanding) {
+    let name = file
+        .file_name()
+        .unwrap_or(file.as_os_str())
+        .to_string_lossy();
+    eprintln!("{name}: {}", understood.summary());
+    for warning in &understood.warnings {
+        eprintln!("  warning: {warning}");
+    }
 }
 
 /// A bar on standard error, if that is a terminal.

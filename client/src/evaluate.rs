@@ -9,13 +9,14 @@ use emp_client::{
     Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult, EvaluationStarted,
     GoalStatistics, MassRange, Metric, ProceduralClips, Push, Randomization, Spread,
 };
-use emp_motion::{Clip, atomic};
+use emp_motion::atomic;
 use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
 use crate::{
     cli::{self, Evaluate},
     command::{INTERRUPTED, progress_bar},
+    recordings::{LeftOut, Recordings},
 };
 
 /// How an evaluation ended.
@@ -28,6 +29,9 @@ enum End {
 /// What came of an evaluation, as far as it got.
 #[derive(Default)]
 struct Outcome {
+    /// Motion files that were read.
+    read: usize,
+    left_out: Vec<LeftOut>,
     started: Option<EvaluationStarted>,
     episodes: Vec<EpisodeResult>,
     result: Option<EvaluationResult>,
@@ -38,11 +42,21 @@ pub(crate) async fn run(
     command: &Evaluate,
     as_json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let paths = command.motions.clone();
+    let (paths, options) = (command.motions.clone(), command.reading.options());
     // Large recordings take seconds to parse.
-    let motions = tokio::task::spawn_blocking(move || load(&paths)).await??;
-    let mut evaluation = client.evaluate(config(command), motions).await?;
-    let mut outcome = Outcome::default();
+    let recordings = tokio::task::spawn_blocking(move || Recordings::read(&paths, &options));
+    let recordings = recordings.await??;
+    anyhow::ensure!(
+        !recordings.clips.is_empty() || command.procedural > 0,
+        "none of {} motion files is readable",
+        recordings.left_out.len()
+    );
+    let mut outcome = Outcome {
+        read: recordings.clips.len(),
+        left_out: recordings.left_out,
+        ..Outcome::default()
+    };
+    let mut evaluation = client.evaluate(config(command), recordings.clips).await?;
     let end = follow(&mut evaluation, &mut outcome).await;
     // A job that goes on for nobody would keep others out.
     drop(evaluation);
@@ -73,18 +87,6 @@ fn report(
         outcome.print(command, started);
     }
     Ok(())
-}
-
-fn load(paths: &[std::path::PathBuf]) -> anyhow::Result<Vec<Clip>> {
-    let mut motions = Vec::new();
-    for path in paths {
-        if path.is_dir() {
-            motions.extend(emp_motion::load_dir(path)?);
-        } else {
-            motions.push(emp_motion::load(path)?);
-        }
-    }
-    Ok(motions)
 }
 
 fn config(command: &Evaluate) -> EvaluateConfig {
@@ -193,6 +195,8 @@ impl Outcome {
         object.insert("model_version".to_owned(), json!(started.model_version));
         object.insert("seed".to_owned(), json!(command.seed));
         object.insert("complete".to_owned(), json!(self.result.is_some()));
+        object.insert("motions_read".to_owned(), json!(self.read));
+        object.insert("motions_left_out".to_owned(), json!(self.left_out));
         for (name, set) in self.sets() {
             let values = set_json(&set);
             if name == "all" {
@@ -228,6 +232,10 @@ impl Outcome {
             command.seed,
             self.episodes.len(),
         );
+        if !self.left_out.is_empty() {
+            let (out, all) = (self.left_out.len(), self.left_out.len() + self.read);
+            println!("  left out: {out} of {all} motion files, which cannot be read");
+        }
         let sets = self.sets();
         print!("  {:<34}", "");
         for (name, set) in &sets {

@@ -10,7 +10,7 @@
 //! let client = Client::connect("http://127.0.0.1:50051").await?;
 //! let config = StreamConfig { delivery: Delivery::All, ..StreamConfig::for_robot("emp27") };
 //! let (mut sender, mut events) = client.stream(config).await?;
-//! let clip = emp_motion::load("motion.bvh".as_ref())?.resampled(50.0);
+//! let clip = emp_motion::load("motion.bvh".as_ref())?.resampled(50.0)?;
 //! tokio::spawn(async move {
 //!     for frame in &clip.frames {
 //!         if sender.send(frame, None).await.is_err() {

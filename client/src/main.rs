@@ -5,6 +5,8 @@
 mod cli;
 mod command;
 mod evaluate;
+mod inspect;
+mod recordings;
 mod report;
 mod retarget;
 mod session;
@@ -40,13 +42,15 @@ fn failure(error: &anyhow::Error) -> ExitCode {
 }
 
 async fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    let client = emp_client::Client::connect(&arguments.server).await?;
-    match arguments.command {
-        Command::Retarget(command) => retarget::run(&client, &command, arguments.json).await,
-        Command::Evaluate(command) => evaluate::run(&client, &command, arguments.json).await,
-        Command::Operate(command) => session::operate(&client, &command, arguments.json).await,
-        Command::Observe(command) => session::observe(&client, &command, arguments.json).await,
-        Command::Robots => report::robots(&client, arguments.json).await,
-        Command::Models => report::models(&client, arguments.json).await,
+    let json = arguments.json;
+    let connect = || emp_client::Client::connect(&arguments.server);
+    match &arguments.command {
+        Command::Inspect(command) => inspect::run(command, json),
+        Command::Retarget(command) => retarget::run(&connect().await?, command, json).await,
+        Command::Evaluate(command) => evaluate::run(&connect().await?, command, json).await,
+        Command::Operate(command) => session::operate(&connect().await?, command, json).await,
+        Command::Observe(command) => session::observe(&connect().await?, command, json).await,
+        Command::Robots => report::robots(&connect().await?, json).await,
+        Command::Models => report::models(&connect().await?, json).await,
     }
 }

@@ -30,7 +30,13 @@ pub(crate) async fn run(
     command: &Retarget,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let (clip, rate) = command::motion(client, &command.file, &command.robot).await?;
+    let (clip, rate) = command::recording(
+        client,
+        &command.file,
+        command.reading.options(),
+        &command.robot,
+    )
+    .await?;
     let config = StreamConfig {
         delivery: if command.realtime {
             Delivery::Latest

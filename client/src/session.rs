@@ -22,7 +22,13 @@ pub(crate) async fn operate(
     command: &Operate,
     as_json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let (clip, rate) = command::motion(client, &command.file, &command.robot).await?;
+    let (clip, rate) = command::recording(
+        client,
+        &command.file,
+        command.reading.options(),
+        &command.robot,
+    )
+    .await?;
     let config = TeleoperationConfig {
         emp_mode: command.emp_mode.map_or(EmpMode::Unspecified, EmpMode::from),
         ..TeleoperationConfig::new(&command.robot, &command.session)

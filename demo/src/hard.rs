@@ -45,7 +45,7 @@ impl HardMotions {
         robot: &Robot,
     ) -> Result<Motion> {
         let source = &self.sources[number];
-        let clip = source.resampled(robot.control_rate_hz());
+        let clip = source.resampled(robot.control_rate_hz())?;
         let goals = retargeted(client, robot, &clip).await?;
         let goals = GoalClip::new(robot, &clip.name, Source::Procedural, &goals)?;
         let wide = goals.scaled_amplitude(robot, self.amplitude as f32);

@@ -24,7 +24,7 @@ impl Motion {
     pub(crate) fn load(file: Option<&Path>, rate: f64) -> Result<Self> {
         match file {
             Some(file) => Self::recording(file, rate),
-            None => Ok(Self::medley(rate)),
+            None => Self::medley(rate),
         }
     }
 
@@ -35,7 +35,7 @@ impl Motion {
             .context("a motion file has no name")?
             .to_string_lossy()
             .into_owned();
-        Ok(Self::whole(name, clip.resampled(rate)))
+        Ok(Self::whole(name, clip.resampled(rate)?))
     }
 
     /// A clip at the robot's control rate whose parts have no names.
@@ -47,15 +47,15 @@ impl Motion {
         }
     }
 
-    fn medley(rate: f64) -> Self {
+    fn medley(rate: f64) -> Result<Self> {
         let (clip, starts) = skills::medley_with_starts(SEED);
         let seconds = starts.iter().map(|&frame| frame as f64 / clip.fps);
         let parts = seconds.zip(Skill::ALL.map(Skill::name)).collect();
-        Self {
+        Ok(Self {
             name: clip.name.clone(),
-            clip: clip.resampled(rate),
+            clip: clip.resampled(rate)?,
             parts,
-        }
+        })
     }
 
     /// What is going on at a time in seconds; empty where that has no name.

@@ -3,11 +3,12 @@
 
 use std::path::Path;
 
-use emp_motion::{BvhOptions, bvh};
+use emp_motion::{ReadOptions, bvh};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|data: &[u8]| {
-    if let Ok(clip) = bvh::from_bytes(Path::new("fuzz.bvh"), data, &BvhOptions::default()) {
-        assert_eq!(clip.validate(), Ok(()));
+    let read = bvh::from_bytes(Path::new("fuzz.bvh"), data, &ReadOptions::default());
+    if let Ok(reading) = read {
+        assert_eq!(reading.clip.validate(), Ok(()));
     }
 });

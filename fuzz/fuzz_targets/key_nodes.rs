@@ -6,7 +6,7 @@ mod archive;
 
 use std::path::Path;
 
-use emp_motion::key_nodes;
+use emp_motion::{ReadOptions, key_nodes};
 use libfuzzer_sys::fuzz_target;
 
 const NODES: [&str; 8] = [
@@ -41,7 +41,8 @@ fuzz_target!(|data: &[u8]| {
 });
 
 fn check(archive: &[u8]) {
-    if let Ok(clip) = key_nodes::from_bytes(Path::new("fuzz.npz"), archive) {
-        assert_eq!(clip.validate(), Ok(()));
+    let read = key_nodes::from_bytes(Path::new("fuzz.npz"), archive, &ReadOptions::default());
+    if let Ok(reading) = read {
+        assert_eq!(reading.clip.validate(), Ok(()));
     }
 }

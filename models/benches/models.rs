@@ -268,7 +268,10 @@ fn retargeter(c: &mut Criterion) {
     let robot = emp27();
     let weights = root().join("models/weights/emp27-retargeter.safetensors");
     let retargeter = Retargeter::load(&weights, robot.clone()).expect("the shipped weights load");
-    let frames = skills::medley(1).resampled(50.0).frames;
+    let frames = skills::medley(1)
+        .resampled(50.0)
+        .expect("an ordinary rate")
+        .frames;
     let mut group = c.benchmark_group("retargeter");
     for batch in [1, 4, 16, 64, 256] {
         group.throughput(Throughput::Elements(batch as u64));

@@ -53,6 +53,9 @@ pub enum ModelError {
         /// What is wrong and what was expected.
         reason: String,
     },
+    /// A clip cannot be brought to the robot's rate.
+    #[error(transparent)]
+    Resample(#[from] emp_motion::ResampleError),
     /// The tensor library refused an operation.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),

@@ -62,7 +62,7 @@ fn target_of(robot: &Robot, angles: &[f64]) -> Target {
 }
 
 fn medley() -> Clip {
-    skills::medley(3).resampled(50.0)
+    skills::medley(3).resampled(50.0).expect("an ordinary rate")
 }
 
 fn network(robot: &Robot) -> RetargetNetwork {
@@ -394,7 +394,7 @@ fn clips_are_answered_as_streams_are_and_alike_on_any_number_of_threads() {
         ));
         let retargeter = Retargeter::load(&weights, robot.clone()).unwrap();
         let mut clips = skills::library(5, 5);
-        clips[1] = clips[1].resampled(30.0);
+        clips[1] = clips[1].resampled(30.0).expect("an ordinary rate");
         let [one, two, three] =
             [1, 2, 3].map(|threads| retarget_clips(&retargeter, &clips, threads).unwrap());
         assert!(one == two && one == three, "{}", robot.name());
@@ -404,7 +404,9 @@ fn clips_are_answered_as_streams_are_and_alike_on_any_number_of_threads() {
         );
 
         for (clip, rows) in clips.iter().zip(&one) {
-            let clip = clip.resampled(robot.control_rate_hz());
+            let clip = clip
+                .resampled(robot.control_rate_hz())
+                .expect("an ordinary rate");
             assert_eq!(rows.len(), clip.frames.len());
             let mut smoother = Smoother::new();
             let mut mode = Mode::Begin;

@@ -1,6 +1,6 @@
 //! A sequence of poses at a constant rate.
 
-use crate::{FrameError, KeyNodeFrame, resample};
+use crate::{FrameError, KeyNodeFrame, ResampleError, resample};
 
 /// A recorded or generated motion.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,13 +36,21 @@ impl Clip {
     /// Bone directions and wrist orientations are interpolated on their spheres (cubic, continuous velocity), so that
     /// bones keep their lengths; before going to a lower rate, everything above the new rate's Nyquist frequency is
     /// filtered out without delay. The last frame is dropped where it falls between two frames of the new rate.
-    #[must_use]
-    pub fn resampled(&self, fps: f64) -> Self {
-        Self {
+    ///
+    /// # Errors
+    /// A rate that is not a positive number, and a clip so slow that it would become more than a million frames.
+    pub fn resampled(&self, fps: f64) -> Result<Self, ResampleError> {
+        Ok(Self {
             name: self.name.clone(),
             fps,
-            frames: resample::resample(&self.frames, self.fps, fps),
-        }
+            frames: resample::resample(&self.frames, self.fps, fps)?,
+        })
+    }
+
+    /// How many frames [`resampled`](Self::resampled) makes, without making them; both rates positive. Saturates.
+    #[must_use]
+    pub fn resampled_len(&self, fps: f64) -> usize {
+        resample::resampled_len(self.frames.len(), self.fps, fps)
     }
 
     /// The motion seen in a mirror.
@@ -56,12 +64,14 @@ impl Clip {
     }
 
     /// The motion `factor` times as fast, at the same frame rate.
-    #[must_use]
-    pub fn time_warped(&self, factor: f64) -> Self {
-        Self {
+    ///
+    /// # Errors
+    /// As [`resampled`](Self::resampled).
+    pub fn time_warped(&self, factor: f64) -> Result<Self, ResampleError> {
+        Ok(Self {
             name: format!("{}-x{factor:.2}", self.name),
             fps: self.fps,
-            frames: resample::resample(&self.frames, self.fps * factor, self.fps),
-        }
+            frames: resample::resample(&self.frames, self.fps * factor, self.fps)?,
+        })
     }
 }

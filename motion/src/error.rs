@@ -37,6 +37,27 @@ pub enum FrameError {
     },
 }
 
+/// Why a motion cannot be brought to another rate.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum ResampleError {
+    /// A rate is not a positive number.
+    #[error("expected a rate above 0 frames a second, found {rate}")]
+    Rate {
+        /// The rate found, frames a second.
+        rate: f64,
+    },
+    /// The motion is so slow that its frames would fill the memory.
+    #[error(
+        "{frames} frames at the new rate; expected at most {limit}: is the motion's frame rate right?"
+    )]
+    TooManyFrames {
+        /// Frames it would have.
+        frames: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+}
+
 /// Why a motion file could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum MotionError {

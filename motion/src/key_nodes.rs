@@ -9,8 +9,10 @@ use std::path::Path;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use crate::npz::{Npz, NpzWriter};
-use crate::source::{self, Heading, WorldFrame};
-use crate::{Clip, KEY_NODES, KeyNode, KeyNodeFrame, MotionError, Side};
+use crate::source::{self, Heading, Rate, node_joint};
+use crate::understanding::{Reading, Understanding};
+use crate::world_frame::WorldFrame;
+use crate::{Clip, KEY_NODES, KeyNode, KeyNodeFrame, MotionError, ReadOptions, Side};
 
 /// Height of the shoulder line over the waist as a share of the arm's length (neutral SMPL body: 0.45 m over 0.51 m).
 const TRUNK_PER_ARM: f64 = 0.88;
@@ -35,16 +37,20 @@ const NODE_NAMES: [(KeyNode, &[&str]); KEY_NODES] = [
 ///
 /// # Errors
 /// [`MotionError`] naming the array that is missing or wrong, or the frame.
-pub fn read(path: &Path) -> Result<Clip, MotionError> {
-    from_bytes(path, &source::read_file(path)?)
+pub fn read(path: &Path, options: &ReadOptions) -> Result<Reading, MotionError> {
+    from_bytes(path, &source::read_file(path)?, options)
 }
 
 /// Reads a key-node file's content; `path` names the clip and the errors.
 ///
 /// # Errors
 /// As [`read`].
-pub fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Clip, MotionError> {
-    from_npz(path, &mut Npz::open(path, bytes)?)
+pub fn from_bytes(
+    path: &Path,
+    bytes: &[u8],
+    options: &ReadOptions,
+) -> Result<Reading, MotionError> {
+    from_npz(path, &mut Npz::open(path, bytes)?, options)
 }
 
 /// Writes a clip; the file appears whole or not at all.
@@ -88,19 +94,89 @@ pub(crate) fn recognises(npz: &Npz) -> bool {
     npz.has("nodes") && npz.has("pos")
 }
 
-pub(crate) fn from_npz(path: &Path, npz: &mut Npz) -> Result<Clip, MotionError> {
-    let fps = npz.scalar("fps")?;
+pub(crate) fn from_npz(
+    path: &Path,
+    npz: &mut Npz,
+    options: &ReadOptions,
+) -> Result<Reading, MotionError> {
+    let rate = match options.fps {
+        Some(fps) => Rate::given(fps),
+        None => Rate::found(npz.scalar("fps")?),
+    };
+    let rate = rate.map_err(|reason| MotionError::format(path, reason))?;
     let nodes = Nodes::new(npz)?;
     let wrists = wrist_rotations(npz, nodes.frames)?;
-    source::check_size(path, fps, nodes.frames)?;
-    if nodes.columns[KeyNode::Waist as usize].is_some() {
-        return as_written(path, fps, &nodes, &wrists);
+    source::check_size(path, rate.fps, nodes.frames)?;
+    let mut warnings: Vec<String> = rate.warning.into_iter().collect();
+    let plain = ReadOptions {
+        fps: options.fps,
+        ..ReadOptions::default()
+    };
+    if *options != plain {
+        warnings.push(
+            "--unit, --up, --map and --mirror have no effect: the format leaves none of it open"
+                .to_owned(),
+        );
     }
-    let trunk = Trunk::new(npz, &nodes)?;
+    let finished = nodes.columns[KeyNode::Waist as usize].is_some();
+    let clip = if finished {
+        as_written(path, rate.fps, &nodes, &wrists)?
+    } else {
+        rebuilt(path, npz, rate.fps, &nodes, wrists)?
+    };
+    let hand = |side: Side| {
+        let known = clip
+            .frames
+            .iter()
+            .any(|f| f.wrist_rotations[side as usize].is_some());
+        let text = if known {
+            "followed as the file says"
+        } else {
+            "not followed: the file does not know them"
+        };
+        text.to_owned()
+    };
+    let understanding = Understanding {
+        format: "key nodes",
+        naming: if finished { "key node" } else { "marker" }.to_owned(),
+        frames: clip.frames.len(),
+        fps: clip.fps,
+        unit: None,
+        up: None,
+        handedness: None,
+        height: None,
+        joints: KeyNode::ALL
+            .into_iter()
+            .map(|node| {
+                let column = nodes.columns[node as usize];
+                node_joint(
+                    node,
+                    column.map_or("rebuilt", |column| &nodes.names[column]),
+                )
+            })
+            .collect(),
+        hands: Side::BOTH.map(hand),
+        warnings,
+    };
+    Ok(Reading {
+        clip,
+        understanding,
+    })
+}
+
+/// A marker file's motion on a trunk of the body's own scale.
+fn rebuilt(
+    path: &Path,
+    npz: &Npz,
+    fps: f64,
+    nodes: &Nodes,
+    wrists: Vec<[Option<Rotation3<f64>>; 2]>,
+) -> Result<Clip, MotionError> {
+    let trunk = Trunk::new(npz, nodes)?;
     let frames: Vec<WorldFrame> = wrists
         .into_iter()
         .enumerate()
-        .map(|(frame, wrists)| trunk.world_frame(&nodes, frame, wrists))
+        .map(|(frame, wrists)| trunk.world_frame(nodes, frame, wrists))
         .collect();
     source::into_clip(path, fps, &frames, Heading::Exact)
 }

@@ -54,6 +54,11 @@ impl<'a> Npz<'a> {
             .is_some()
     }
 
+    /// The first of these arrays that is there.
+    pub(crate) fn first(&self, names: &[&'static str]) -> Option<&'static str> {
+        names.iter().copied().find(|name| self.has(name))
+    }
+
     /// The names of the arrays, for messages.
     pub(crate) fn names(&self) -> String {
         let readable = self.archive.file_names().filter_map(Result::ok);

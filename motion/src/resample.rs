@@ -2,7 +2,7 @@
 
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
-use crate::{KEY_NODES, KeyNode, KeyNodeFrame};
+use crate::{KEY_NODES, KeyNode, KeyNodeFrame, ResampleError};
 
 /// Share of the new Nyquist frequency that the low-pass lets through.
 const PASS_BAND: f64 = 0.9;
@@ -10,6 +10,8 @@ const PASS_BAND: f64 = 0.9;
 const LOW_PASS_HALF_WIDTH: f64 = 4.0;
 /// Rates that differ by less than this share are the same rate.
 const SAME_RATE: f64 = 1e-6;
+/// Resampling makes no more frames than this: five and a half hours at 50 Hz, about 0.5 GB while it works.
+pub(crate) const MAX_RESAMPLED: usize = 1_000_000;
 
 /// A pose as directions on spheres, where interpolation is meaningful.
 #[derive(Clone)]
@@ -21,21 +23,47 @@ struct Joints {
     wrists: [Option<UnitQuaternion<f64>>; 2],
 }
 
+/// How many frames `count` frames at `from` frames a second become at `to`; both rates positive. Saturates.
+pub(crate) fn resampled_len(count: usize, from: f64, to: f64) -> usize {
+    if count < 2 || (from / to - 1.0).abs() < SAME_RATE {
+        return count;
+    }
+    (((count - 1) as f64 / from * to + SAME_RATE).floor() as usize).saturating_add(1)
+}
+
 /// Frames at `to` frames a second of a motion given at `from`; empty in, empty out.
-pub(crate) fn resample(frames: &[KeyNodeFrame], from: f64, to: f64) -> Vec<KeyNodeFrame> {
+///
+/// # Errors
+/// A rate that is not a positive number, or more than [`MAX_RESAMPLED`] frames to make; nothing is made then.
+pub(crate) fn resample(
+    frames: &[KeyNodeFrame],
+    from: f64,
+    to: f64,
+) -> Result<Vec<KeyNodeFrame>, ResampleError> {
+    for rate in [from, to] {
+        if !(rate.is_finite() && rate > 0.0) {
+            return Err(ResampleError::Rate { rate });
+        }
+    }
+    let count = resampled_len(frames.len(), from, to);
     if frames.len() < 2 || (from / to - 1.0).abs() < SAME_RATE {
-        return frames.to_vec();
+        return Ok(frames.to_vec());
+    }
+    if count > MAX_RESAMPLED {
+        return Err(ResampleError::TooManyFrames {
+            frames: count,
+            limit: MAX_RESAMPLED,
+        });
     }
     let mut joints: Vec<Joints> = frames.iter().map(Joints::new).collect();
     if to < from {
         joints = low_passed(&joints, to / from);
     }
     let last = joints.len() - 1;
-    let count = (last as f64 / from * to + SAME_RATE).floor() as usize + 1;
     let origin = frames[0].position(KeyNode::Waist);
-    (0..count)
+    Ok((0..count)
         .map(|i| at(&joints, (i as f64 * from / to).min(last as f64)).frame(origin))
-        .collect()
+        .collect())
 }
 
 /// Catmull–Rom interpolation at `index` (frames, fractional). Beyond its ends the motion is taken to go on straight, which

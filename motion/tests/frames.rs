@@ -2,7 +2,9 @@
 
 use emp_motion::joint_csv::JointCsvWriter;
 use emp_motion::skills::{Skill, generate};
-use emp_motion::{BoneLengths, Clip, FrameError, KEY_NODES, KeyNode, KeyNodeFrame, Side};
+use emp_motion::{
+    BoneLengths, Clip, FrameError, KEY_NODES, KeyNode, KeyNodeFrame, ResampleError, Side,
+};
 use nalgebra::{Rotation3, Vector3};
 
 /// Arms forward, elbows straight, thumbs up.
@@ -149,7 +151,9 @@ fn other_bone_lengths_keep_directions() {
 #[test]
 fn resampling_turns_evenly_and_keeps_bones() {
     for fps in [24.0, 30.0, 100.0, 119.875, 120.0] {
-        let clip = turning(fps, 2.0, 3.0).resampled(50.0);
+        let clip = turning(fps, 2.0, 3.0)
+            .resampled(50.0)
+            .expect("an ordinary rate");
         assert!(
             (clip.duration() - 2.0).abs() <= 0.02 + 1.0 / fps,
             "{fps}: {}",
@@ -185,7 +189,7 @@ fn going_down_to_50_hz_does_not_alias() {
             frame.position(KeyNode::LeftElbow) + rotation * Vector3::new(0.25, 0.0, 0.0);
         frame.wrist_rotations[0] = Some(rotation);
     }
-    let slow = clip.resampled(50.0);
+    let slow = clip.resampled(50.0).expect("an ordinary rate");
     for frame in &slow.frames[5..slow.frames.len() - 5] {
         assert!(angle(frame.forearm(Side::Left)).abs() < 0.002);
         assert!(angle(frame.wrist_rotations[0].expect("known") * Vector3::x()).abs() < 0.002);
@@ -207,7 +211,11 @@ fn going_up_does_not_inflate_jerk() {
         (third.map(|j| j * j).sum::<f32>() / wrist.len() as f32).sqrt()
     };
     let original = generate(Skill::WipeWindow, 1);
-    let there_and_back = original.resampled(24.0).resampled(50.0);
+    let there_and_back = original
+        .resampled(24.0)
+        .expect("an ordinary rate")
+        .resampled(50.0)
+        .expect("an ordinary rate");
     assert!(
         jerk(&there_and_back) < 1.6 * jerk(&original),
         "{} of {}",
@@ -224,6 +232,7 @@ fn a_wrist_known_for_a_while_stays_known_for_that_while() {
     }
     let known: Vec<bool> = clip
         .resampled(50.0)
+        .expect("an ordinary rate")
         .frames
         .iter()
         .map(|f| f.wrist_rotations[0].is_some())
@@ -241,12 +250,12 @@ fn a_wrist_known_for_a_while_stays_known_for_that_while() {
 #[test]
 fn time_warp_changes_speed_not_rate() {
     let clip = turning(50.0, 2.0, 1.0);
-    let fast = clip.time_warped(2.0);
+    let fast = clip.time_warped(2.0).expect("an ordinary rate");
     assert_eq!(fast.fps, 50.0);
     assert!((fast.duration() - 1.0).abs() < 0.021);
     let last = fast.frames.last().expect("frames").forearm(Side::Left);
     assert!((angle(last) - 2.0).abs() < 0.05);
-    assert!((clip.time_warped(0.5).duration() - 4.0).abs() < 0.021);
+    assert!((clip.time_warped(0.5).expect("an ordinary rate").duration() - 4.0).abs() < 0.021);
 }
 
 #[test]
@@ -256,17 +265,65 @@ fn short_clips_survive() {
         fps: 120.0,
         frames: vec![pose()],
     };
-    assert_eq!(one.resampled(50.0).frames, vec![pose()]);
+    assert_eq!(
+        one.resampled(50.0).expect("an ordinary rate").frames,
+        vec![pose()]
+    );
     assert_eq!(one.duration(), 0.0);
     let none = Clip {
         name: "none".to_owned(),
         fps: 120.0,
         frames: Vec::new(),
     };
-    assert!(none.resampled(50.0).frames.is_empty());
+    assert!(
+        none.resampled(50.0)
+            .expect("an ordinary rate")
+            .frames
+            .is_empty()
+    );
     let two = turning(120.0, 1.0 / 120.0, 1.0);
-    assert_eq!(two.resampled(50.0).frames.len(), 1);
+    assert_eq!(
+        two.resampled(50.0).expect("an ordinary rate").frames.len(),
+        1
+    );
     assert_eq!(two.frames[0].positions.len(), KEY_NODES);
+}
+
+#[test]
+fn a_slow_clip_cannot_fill_the_memory() {
+    let mut clip = turning(120.0, 1.0 / 120.0, 1.0);
+    assert_eq!(clip.frames.len(), 2);
+    for fps in [1e-9, 1e-6, 2e-308, f64::MIN_POSITIVE] {
+        clip.fps = fps;
+        let error = clip.resampled(50.0).expect_err("too many frames");
+        assert!(
+            matches!(error, ResampleError::TooManyFrames { limit: 1_000_000, frames } if frames > 1_000_000),
+            "{fps}: {error}"
+        );
+        assert_eq!(clip.resampled(fps).expect("as it is").frames.len(), 2);
+    }
+    clip.fps = 100.0;
+    assert!(matches!(
+        clip.time_warped(1e-9),
+        Err(ResampleError::TooManyFrames { .. })
+    ));
+    for rate in [0.0, -50.0, f64::NAN, f64::INFINITY] {
+        assert!(matches!(
+            clip.resampled(rate),
+            Err(ResampleError::Rate { .. })
+        ));
+        let odd = Clip {
+            fps: rate,
+            ..clip.clone()
+        };
+        assert!(matches!(
+            odd.resampled(50.0),
+            Err(ResampleError::Rate { .. })
+        ));
+    }
+    clip.fps = 0.5;
+    assert_eq!(clip.resampled_len(50.0), 101);
+    assert_eq!(clip.resampled(50.0).expect("bounded").frames.len(), 101);
 }
 
 #[test]

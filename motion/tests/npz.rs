@@ -1,11 +1,14 @@
-//! The AMASS and key-node readers and the key-node writer on small archives with a known answer, and on broken ones.
+//! The SMPL family's and key-node readers and the key-node writer on small archives with a known answer, and on broken ones.
 
 mod common;
 
 use std::path::Path;
 
 use common::{f4, f8, markers, npy, npz, unicode};
-use emp_motion::{Clip, KeyNode, KeyNodeFrame, MotionError, Side, amass, key_nodes, load, skills};
+use emp_motion::{
+    Clip, KeyNode, KeyNodeFrame, MotionError, ReadOptions, Side, UpAxis, key_nodes, load, skills,
+    smpl,
+};
 use nalgebra::{Rotation3, Vector3};
 use proptest::prelude::*;
 
@@ -18,12 +21,22 @@ fn close(a: Vector3<f32>, b: [f32; 3], tolerance: f32) {
     );
 }
 
-fn read_amass(entries: &[(&str, Vec<u8>)]) -> Result<Clip, MotionError> {
-    amass::from_bytes(Path::new("clip.npz"), &npz(entries))
+fn read_smpl(entries: &[(&str, Vec<u8>)]) -> Result<Clip, MotionError> {
+    smpl_bytes(&npz(entries))
+}
+
+fn smpl_bytes(bytes: &[u8]) -> Result<Clip, MotionError> {
+    let read = smpl::from_bytes(Path::new("clip.npz"), bytes, &ReadOptions::default());
+    read.map(|reading| reading.clip)
+}
+
+fn nodes_bytes(bytes: &[u8]) -> Result<Clip, MotionError> {
+    let read = key_nodes::from_bytes(Path::new("clip.npz"), bytes, &ReadOptions::default());
+    read.map(|reading| reading.clip)
 }
 
 fn read_nodes(entries: &[(&str, Vec<u8>)]) -> Result<Clip, MotionError> {
-    key_nodes::from_bytes(Path::new("clip.npz"), &npz(entries))
+    nodes_bytes(&npz(entries))
 }
 
 /// Axis-angle values of the SMPL-H T pose in a z-up world, facing `yaw`, with one more joint turned.
@@ -48,7 +61,7 @@ fn smpl_h(frames: &[Vec<f64>]) -> Entries {
 fn smpl_h_t_pose_is_upright_with_palms_down_at_any_heading() {
     for yaw in [0.0, 1.0, -2.5] {
         let clip =
-            read_amass(&smpl_h(&vec![smpl_pose(yaw, 1, Vector3::zeros()); 2])).expect("valid");
+            read_smpl(&smpl_h(&vec![smpl_pose(yaw, 1, Vector3::zeros()); 2])).expect("valid");
         assert_eq!(clip.fps, 120.0);
         let frame = &clip.frames[0];
         close(
@@ -71,7 +84,7 @@ fn smpl_h_t_pose_is_upright_with_palms_down_at_any_heading() {
 fn smpl_elbow_turns_forearm_and_hand() {
     // Left elbow −90° about the body's y (up): the left forearm from sideways to forward, the thumb to the right.
     let turn = Vector3::y() * -std::f64::consts::FRAC_PI_2;
-    let clip = read_amass(&smpl_h(&[smpl_pose(0.0, 18, turn)])).expect("valid");
+    let clip = read_smpl(&smpl_h(&[smpl_pose(0.0, 18, turn)])).expect("valid");
     close(
         clip.frames[0].forearm(Side::Left),
         [0.999, -0.005, 0.036],
@@ -85,13 +98,13 @@ fn smpl_elbow_turns_forearm_and_hand() {
 #[test]
 fn smpl_x_fields_give_the_same_motion_as_smpl_h() {
     let pose = smpl_pose(0.7, 16, Vector3::new(0.3, -0.2, 0.9));
-    let other = read_amass(&[
+    let other = read_smpl(&[
         ("root_orient", f4("(1, 3)", pose[..3].to_vec())),
         ("pose_body", f4("(1, 63)", pose[3..66].to_vec())),
         ("mocap_frame_rate", f8("()", [120.0])),
     ])
     .expect("valid");
-    let clip = read_amass(&smpl_h(&[pose])).expect("valid");
+    let clip = read_smpl(&smpl_h(&[pose])).expect("valid");
     for (a, b) in clip.frames[0]
         .positions
         .iter()
@@ -102,11 +115,126 @@ fn smpl_x_fields_give_the_same_motion_as_smpl_h() {
 }
 
 #[test]
-fn broken_amass_files_name_the_array() {
+fn every_name_and_shape_of_the_family_gives_the_same_motion() {
+    let poses: Vec<Vec<f64>> = (0..3)
+        .map(|i| smpl_pose(0.4 * f64::from(i), 16, Vector3::new(0.3, -0.2, 0.9)))
+        .collect();
+    let expected = read_smpl(&smpl_h(&poses)).expect("valid");
+    let rate = |name| (name, f8("()", [120.0]));
+    let part = |from: usize, to: usize| poses.iter().flat_map(move |p| p[from..to].to_vec());
+    let matrices = |from: usize, to: usize| {
+        part(from, to)
+            .collect::<Vec<f64>>()
+            .as_chunks::<3>()
+            .0
+            .iter()
+            .flat_map(|v| {
+                let matrix = Rotation3::from_scaled_axis(Vector3::from(*v)).into_inner();
+                matrix.transpose().as_slice().to_vec()
+            })
+            .collect::<Vec<f64>>()
+    };
+    let files = [
+        vec![("poses", f8("(3, 72)", part(0, 72))), rate("fps")],
+        vec![
+            ("smpl_poses", f8("(3, 24, 3)", part(0, 72))),
+            rate("frame_rate"),
+        ],
+        vec![
+            ("pose", f8("(3, 52, 3)", part(0, 156))),
+            rate("mocap_framerate"),
+        ],
+        vec![
+            ("poses", f8("(3, 24, 3, 3)", matrices(0, 72))),
+            rate("framerate"),
+        ],
+        vec![
+            ("root_orient", f8("(3, 1, 3)", part(0, 3))),
+            ("pose_body", f8("(3, 23, 3)", part(3, 72))),
+            rate("fps"),
+        ],
+        vec![
+            ("global_orient", f8("(3, 3, 3)", matrices(0, 3))),
+            ("body_pose", f8("(3, 21, 3, 3)", matrices(3, 66))),
+            rate("fps"),
+        ],
+        vec![
+            ("global_orient", f8("(3, 1, 3, 3)", matrices(0, 3))),
+            ("body_pose", f8("(3, 69)", part(3, 72))),
+            rate("fps"),
+        ],
+    ];
+    for file in files {
+        let clip = read_smpl(&file).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(clip.fps, 120.0);
+        for (a, b) in clip.frames.iter().zip(&expected.frames) {
+            for (a, b) in a.positions.iter().zip(&b.positions) {
+                assert!((a - b).norm() < 1e-5, "{}", file[0].0);
+            }
+        }
+    }
+    let quaternions = read_smpl(&[("poses", f8("(3, 24, 4)", vec![0.5; 288])), rate("fps")]);
+    assert!(
+        quaternions
+            .expect_err("a shape")
+            .to_string()
+            .contains("shape [3, 24, 4]")
+    );
+    let sheared = read_smpl(&[("poses", f8("(1, 22, 3, 3)", vec![0.5; 198])), rate("fps")]);
+    assert!(
+        sheared
+            .expect_err("no rotations")
+            .to_string()
+            .contains("joint 0 is no rotation")
+    );
+}
+
+#[test]
+fn any_axis_of_a_smpl_world_may_point_up() {
+    let expected = read_smpl(&smpl_h(&[smpl_pose(0.3, 18, Vector3::y()); 3])).expect("valid");
+    // From the z-up world to others, and the pelvis 0.95 m over a floor at zero.
+    let worlds = [
+        ("y", Vector3::x() * -std::f64::consts::FRAC_PI_2),
+        ("-y", Vector3::x() * std::f64::consts::FRAC_PI_2),
+        ("-z", Vector3::x() * std::f64::consts::PI),
+        ("x", Vector3::y() * std::f64::consts::FRAC_PI_2),
+    ];
+    for (up, turn) in worlds {
+        let turn = Rotation3::from_scaled_axis(turn);
+        let mut pose = smpl_pose(0.3, 18, Vector3::y());
+        let root = turn * Rotation3::from_scaled_axis(Vector3::from_row_slice(&pose[..3]));
+        pose[..3].copy_from_slice(root.scaled_axis().as_slice());
+        let place = turn * Vector3::new(0.4, 1.0, 0.95);
+        let mut file = smpl_h(&[pose.clone(), pose.clone(), pose]);
+        file.push((
+            "trans",
+            f8("(3, 3)", [place; 3].iter().flat_map(|p| [p.x, p.y, p.z])),
+        ));
+        let reading = smpl::from_bytes(Path::new("a.npz"), &npz(&file), &ReadOptions::default())
+            .expect("valid");
+        assert_eq!(reading.understanding.up.as_deref(), Some(up));
+        for (a, b) in reading.clip.frames.iter().zip(&expected.frames) {
+            for (a, b) in a.positions.iter().zip(&b.positions) {
+                assert!((a - b).norm() < 1e-4, "{up}");
+            }
+        }
+        let options = ReadOptions {
+            up: Some(UpAxis::Z),
+            ..ReadOptions::default()
+        };
+        let forced = smpl::from_bytes(Path::new("a.npz"), &npz(&file), &options);
+        assert!(
+            forced.is_err() || forced.is_ok_and(|r| r.understanding.up.as_deref() == Some("z"))
+        );
+    }
+}
+
+#[test]
+fn broken_smpl_files_name_the_array() {
     let good = smpl_h(&[smpl_pose(0.0, 1, Vector3::zeros())]);
     let rate = good[1].1.clone();
     let with = |poses: Vec<u8>| {
-        read_amass(&[("poses", poses), ("mocap_framerate", rate.clone())])
+        read_smpl(&[("poses", poses), ("mocap_framerate", rate.clone())])
             .expect_err("broken")
             .to_string()
     };
@@ -154,9 +282,9 @@ fn broken_amass_files_name_the_array() {
             "{expected}: {message}"
         );
     }
-    let message = read_amass(&good[..1]).expect_err("no rate").to_string();
+    let message = read_smpl(&good[..1]).expect_err("no rate").to_string();
     assert!(message.contains("mocap_frame_rate"), "{message}");
-    let message = read_amass(&[
+    let message = read_smpl(&[
         good[0].clone(),
         ("mocap_framerate", f8("()", [f64::INFINITY])),
     ])
@@ -268,7 +396,7 @@ fn broken_key_node_files_name_array_and_frame() {
         assert!(message.contains(expected), "{expected}: {message}");
     }
     assert!(
-        key_nodes::from_bytes(Path::new("clip.npz"), b"no zip")
+        nodes_bytes(b"no zip")
             .expect_err("no zip")
             .to_string()
             .contains("not an npz archive")
@@ -282,9 +410,7 @@ fn a_small_archive_cannot_ask_for_much_memory() {
     entries[2].1 = npy("<f4", "(3200000, 8, 3)", &vec![0; 307_200_000]);
     let bytes = npz(&entries);
     assert!(bytes.len() < 1_000_000);
-    let message = key_nodes::from_bytes(Path::new("bomb.npz"), &bytes)
-        .expect_err("bomb")
-        .to_string();
+    let message = nodes_bytes(&bytes).expect_err("bomb").to_string();
     assert!(message.contains("larger than the"), "{message}");
 }
 
@@ -370,20 +496,20 @@ fn mutated(entries: Entries) -> impl Strategy<Value = Vec<u8>> {
 proptest! {
     #[test]
     fn arbitrary_bytes_are_answered(bytes in proptest::collection::vec(any::<u8>(), 0..2000)) {
-        prop_assert!(amass::from_bytes(Path::new("x.npz"), &bytes).is_err());
-        prop_assert!(key_nodes::from_bytes(Path::new("x.npz"), &bytes).is_err());
+        prop_assert!(smpl_bytes(&bytes).is_err());
+        prop_assert!(nodes_bytes(&bytes).is_err());
     }
 
     #[test]
-    fn mutated_amass_files_are_an_error_or_a_valid_clip(bytes in mutated(smpl_h(&vec![smpl_pose(0.3, 16, Vector3::x()); 3]))) {
-        if let Ok(clip) = amass::from_bytes(Path::new("x.npz"), &bytes) {
+    fn mutated_smpl_files_are_an_error_or_a_valid_clip(bytes in mutated(smpl_h(&vec![smpl_pose(0.3, 16, Vector3::x()); 3]))) {
+        if let Ok(clip) = smpl_bytes(&bytes) {
             prop_assert_eq!(clip.validate(), Ok(()));
         }
     }
 
     #[test]
     fn mutated_key_node_files_are_an_error_or_a_valid_clip(bytes in mutated(markers(3, |_| 0.2))) {
-        if let Ok(clip) = key_nodes::from_bytes(Path::new("x.npz"), &bytes) {
+        if let Ok(clip) = nodes_bytes(&bytes) {
             prop_assert_eq!(clip.validate(), Ok(()));
         }
     }

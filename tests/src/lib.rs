@@ -204,6 +204,7 @@ pub fn emp27() -> anyhow::Result<Arc<Robot>> {
 pub fn poses(seed: u64, count: usize) -> Vec<KeyNodeFrame> {
     skills::medley(seed)
         .resampled(50.0)
+        .expect("an ordinary rate")
         .frames
         .into_iter()
         .cycle()

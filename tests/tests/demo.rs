@@ -10,7 +10,9 @@ use serde_json::{Value, json};
 /// A wave of this many frames as a file in a folder.
 fn wave(folder: &Path, frames: usize) -> anyhow::Result<PathBuf> {
     let file = folder.join("motion.npz");
-    let mut clip = skills::generate(skills::Skill::Wave, 1).resampled(50.0);
+    let mut clip = skills::generate(skills::Skill::Wave, 1)
+        .resampled(50.0)
+        .expect("an ordinary rate");
     clip.frames.truncate(frames);
     key_nodes::write(&file, &clip)?;
     Ok(file)

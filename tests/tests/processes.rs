@@ -62,7 +62,9 @@ fn the_command_retargets_a_file() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let server = ServerProcess::start(folder.path())?;
     let motion = folder.path().join("motion.npz");
-    let mut clip = skills::generate(skills::Skill::Wave, 1).resampled(50.0);
+    let mut clip = skills::generate(skills::Skill::Wave, 1)
+        .resampled(50.0)
+        .expect("an ordinary rate");
     clip.frames.truncate(150);
     key_nodes::write(&motion, &clip)?;
     let (motion, table) = (
@@ -117,7 +119,9 @@ fn the_command_evaluates_a_controller() -> anyhow::Result<()> {
     let (folder, server) = evaluation_server(weights.path())?;
     let motions = folder.path().join("motions");
     std::fs::create_dir(&motions)?;
-    let clip = skills::generate(skills::Skill::Wave, 1).resampled(50.0);
+    let clip = skills::generate(skills::Skill::Wave, 1)
+        .resampled(50.0)
+        .expect("an ordinary rate");
     key_nodes::write(&motions.join("wave.npz"), &clip)?;
     let table = folder.path().join("episodes.csv");
     let [motions, table] = [motions, table].map(|path| path.to_string_lossy().into_owned());

@@ -62,7 +62,7 @@ fn recorded() -> Vec<Clip> {
     // Longer than one message holds.
     let mut long = skills::medley(2);
     long.name = "a medley".to_owned();
-    let long = long.resampled(200.0);
+    let long = long.resampled(200.0).expect("an ordinary rate");
     assert!(long.frames.len() > 4096);
     vec![clip, long]
 }

@@ -874,7 +874,9 @@ async fn a_robot_stands_while_operators_in_other_processes_come_and_go() -> anyh
     let folder = tempfile::tempdir()?;
     let server = ServerProcess::start(folder.path())?;
     let motion = folder.path().join("wave.npz");
-    let mut clip = skills::generate(skills::Skill::Wave, 3).resampled(50.0);
+    let mut clip = skills::generate(skills::Skill::Wave, 3)
+        .resampled(50.0)
+        .expect("an ordinary rate");
     clip.frames.truncate(125);
     key_nodes::write(&motion, &clip)?;
     let motion = motion.to_string_lossy().into_owned();

@@ -64,7 +64,7 @@ pub fn predict_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, Mo
     if !retargeter.has_network() {
         return follow_clip(retargeter, clip);
     }
-    let clip = clip.resampled(retargeter.robot().control_rate_hz());
+    let clip = clip.resampled(retargeter.robot().control_rate_hz())?;
     let joints = retargeter.robot().goal_joints().len();
     let mut rows = GoalRows::with_capacity(clip.frames.len());
     for frames in clip.frames.chunks(BATCH) {
@@ -95,7 +95,7 @@ fn retarget_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, Model
 /// The refined stream before smoothing.
 fn follow_clip(retargeter: &Retargeter, clip: &Clip) -> Result<GoalRows, ModelError> {
     let robot = retargeter.robot();
-    let clip = clip.resampled(robot.control_rate_hz());
+    let clip = clip.resampled(robot.control_rate_hz())?;
     let period = 1.0 / robot.control_rate_hz();
     let mut solver = Solver::new(robot);
     let mut memory = None;

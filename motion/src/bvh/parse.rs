@@ -1,11 +1,11 @@
-//! The BVH text format: a joint tree and one line of channel values a frame.
+//! The BVH text format: one or more joint trees and one line of channel values a frame.
 
 use std::path::Path;
 
 use nalgebra::Vector3;
 
 use crate::MotionError;
-use crate::source::check_size;
+use crate::source::{MAX_FRAMES, Rate};
 
 /// No skeleton has more joints, end sites included.
 const MAX_JOINTS: usize = 2048;
@@ -13,7 +13,7 @@ const MAX_JOINTS: usize = 2048;
 /// One number of a frame's line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Channel {
-    /// Coordinate along an axis (0 x, 1 y, 2 z), in place of the joint's offset.
+    /// Coordinate along an axis (0 x, 1 y, 2 z).
     Position(usize),
     /// Rotation about an axis, degrees.
     Rotation(usize),
@@ -24,7 +24,7 @@ pub(super) enum Channel {
 pub(super) struct Joint {
     /// Empty for an end site.
     pub(super) name: String,
-    /// Index of the parent, always smaller than the joint's own.
+    /// Index of the parent, always smaller than the joint's own; `None` for a root.
     pub(super) parent: Option<usize>,
     /// From the parent in the parent's frame, file units.
     pub(super) offset: Vector3<f64>,
@@ -40,6 +40,24 @@ impl Joint {
         self.channels
             .iter()
             .any(|channel| matches!(channel, Channel::Rotation(_)))
+    }
+
+    /// Whether the joint moves against its parent.
+    pub(super) fn moves(&self) -> bool {
+        self.channels
+            .iter()
+            .any(|channel| matches!(channel, Channel::Position(_)))
+    }
+
+    /// The joint's position channels, with 0 for an axis without one.
+    pub(super) fn position(&self, values: &[f64]) -> Vector3<f64> {
+        let mut position = Vector3::zeros();
+        for (channel, value) in self.channels.iter().zip(&values[self.first_value..]) {
+            if let Channel::Position(axis) = channel {
+                position[*axis] = *value;
+            }
+        }
+        position
     }
 }
 
@@ -60,16 +78,22 @@ impl Document {
     }
 }
 
-/// Parses a whole file.
-pub(super) fn parse(path: &Path, text: &str) -> Result<Document, MotionError> {
+/// Parses a whole file; `fps` replaces its own rate.
+pub(super) fn parse(
+    path: &Path,
+    text: &str,
+    fps: Option<f64>,
+    warnings: &mut Vec<String>,
+) -> Result<Document, MotionError> {
     let mut reader = Reader::new(path, text);
     let joints = hierarchy(&mut reader)?;
-    let (frames, fps) = motion_header(&mut reader)?;
+    let (announced, rate) = motion_header(&mut reader, fps)?;
+    warnings.extend(rate.warning);
     let width = joints.iter().map(|joint| joint.channels.len()).sum();
-    let values = motion(&mut reader, frames, width)?;
+    let (values, frames) = frame_values(&mut reader, announced, width, warnings)?;
     Ok(Document {
         joints,
-        fps,
+        fps: rate.fps,
         values,
         frames,
     })
@@ -85,7 +109,6 @@ struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     fn new(path: &'a Path, text: &'a str) -> Self {
-        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         Self {
             path,
             lines: text.lines().enumerate(),
@@ -98,12 +121,12 @@ impl<'a> Reader<'a> {
         MotionError::line(self.path, self.line, reason)
     }
 
-    /// Goes to the next line with something on it; `None` at the end of the file.
+    /// Goes to the next line with something on it besides a comment; `None` at the end of the file.
     fn next_line(&mut self) -> Option<&'a str> {
         for (index, line) in self.lines.by_ref() {
-            self.line = index + 1;
             let line = line.trim();
-            if !line.is_empty() {
+            if !(line.is_empty() || line.starts_with('#') || line.starts_with("//")) {
+                self.line = index + 1;
                 return Some(line);
             }
         }
@@ -127,6 +150,19 @@ impl<'a> Reader<'a> {
         Some(word)
     }
 
+    /// Whether the next word is this one; it is taken then.
+    fn takes(&mut self, keyword: &str) -> bool {
+        let before = (self.rest, self.line, self.lines.clone());
+        if self
+            .word()
+            .is_some_and(|word| word.eq_ignore_ascii_case(keyword))
+        {
+            return true;
+        }
+        (self.rest, self.line, self.lines) = before;
+        false
+    }
+
     fn expected_word(&mut self, what: &str) -> Result<&'a str, MotionError> {
         self.word()
             .ok_or_else(|| self.error(format!("the file ends where {what} was expected")))
@@ -137,42 +173,80 @@ impl<'a> Reader<'a> {
         if word.eq_ignore_ascii_case(keyword) {
             Ok(())
         } else {
-            Err(self.error(format!("expected {keyword}, found {word:?}")))
+            Err(self.error(format!("expected {keyword}, found {:?}", shortened(word))))
         }
     }
 
     fn number(&mut self, what: &str) -> Result<f64, MotionError> {
         let word = self.expected_word(what)?;
-        finite(word)
-            .ok_or_else(|| self.error(format!("{what}: expected a finite number, found {word:?}")))
+        finite(word).ok_or_else(|| {
+            let word = shortened(word);
+            self.error(format!("{what}: expected a finite number, found {word:?}"))
+        })
     }
 
     /// The rest of the line up to a brace: a joint's name, which may hold spaces.
     fn name(&mut self) -> Result<String, MotionError> {
-        let end = self.rest.find(['{', '}']).unwrap_or(self.rest.len());
-        let (name, rest) = self.rest.split_at(end);
-        self.rest = rest;
-        let name = name.trim();
+        let name = self.until_brace();
         if name.is_empty() {
             Err(self.error("expected a joint's name"))
         } else {
             Ok(name.to_owned())
         }
     }
+
+    fn until_brace(&mut self) -> &'a str {
+        let end = self.rest.find(['{', '}']).unwrap_or(self.rest.len());
+        let (text, rest) = self.rest.split_at(end);
+        self.rest = rest;
+        text.trim()
+    }
+
+    /// What stands behind `key:` on its line; spaces around the colon do not matter.
+    fn setting(&mut self, key: &str) -> Result<&'a str, MotionError> {
+        let line = if self.rest.is_empty() {
+            self.next_line().unwrap_or_default()
+        } else {
+            self.rest
+        };
+        self.rest = "";
+        let setting = line.split_once(':');
+        match setting {
+            Some((found, value)) if same_words(found, key) => Ok(value.trim()),
+            _ if line.is_empty() => {
+                Err(self.error(format!("the file ends where {key}: was expected")))
+            }
+            _ => Err(self.error(format!("expected {key}:, found {:?}", shortened(line)))),
+        }
+    }
+}
+
+fn same_words(a: &str, b: &str) -> bool {
+    let mut words = a.split_whitespace().zip(b.split_whitespace());
+    a.split_whitespace().count() == b.split_whitespace().count()
+        && words.all(|(a, b)| a.eq_ignore_ascii_case(b))
 }
 
 fn finite(word: &str) -> Option<f64> {
     word.parse().ok().filter(|value: &f64| value.is_finite())
 }
 
+/// Reads `HIERARCHY` and every tree that follows.
 fn hierarchy(reader: &mut Reader) -> Result<Vec<Joint>, MotionError> {
     reader.keyword("HIERARCHY")?;
     reader.keyword("ROOT")?;
     let mut joints = Vec::new();
-    let mut width = 0;
+    tree(reader, &mut joints)?;
+    while reader.takes("ROOT") {
+        tree(reader, &mut joints)?;
+    }
+    Ok(joints)
+}
+
+fn tree(reader: &mut Reader, joints: &mut Vec<Joint>) -> Result<(), MotionError> {
     let root = reader.name()?;
-    open_joint(reader, &mut joints, &mut width, root, None)?;
-    let mut open = vec![0];
+    let mut open = vec![joints.len()];
+    open_joint(reader, joints, root, None)?;
     while let Some(&parent) = open.last() {
         let word = reader.expected_word("JOINT, End Site or }")?;
         match word.to_ascii_lowercase().as_str() {
@@ -182,26 +256,28 @@ fn hierarchy(reader: &mut Reader) -> Result<Vec<Joint>, MotionError> {
             "joint" => {
                 let name = reader.name()?;
                 open.push(joints.len());
-                open_joint(reader, &mut joints, &mut width, name, Some(parent))?;
+                open_joint(reader, joints, name, Some(parent))?;
             }
             "end" => {
                 reader.keyword("Site")?;
-                open_joint(reader, &mut joints, &mut width, String::new(), Some(parent))?;
+                // Some writers name their end sites.
+                reader.until_brace();
+                open_joint(reader, joints, String::new(), Some(parent))?;
                 reader.keyword("}")?;
             }
             _ => {
+                let word = shortened(word);
                 return Err(reader.error(format!("expected JOINT, End Site or }}, found {word:?}")));
             }
         }
     }
-    Ok(joints)
+    Ok(())
 }
 
-/// Reads `{ OFFSET x y z` and, for a joint, `CHANNELS n …`.
+/// Reads `{ OFFSET x y z` and, for a joint that has them, `CHANNELS n …`.
 fn open_joint(
     reader: &mut Reader,
     joints: &mut Vec<Joint>,
-    width: &mut usize,
     name: String,
     parent: Option<usize>,
 ) -> Result<(), MotionError> {
@@ -215,13 +291,14 @@ fn open_joint(
         reader.number("OFFSET y")?,
         reader.number("OFFSET z")?,
     );
-    let channels = if name.is_empty() {
-        Vec::new()
-    } else {
+    let channels = if !name.is_empty() && reader.takes("CHANNELS") {
         channels(reader)?
+    } else {
+        Vec::new()
     };
-    let first_value = *width;
-    *width += channels.len();
+    let first_value = joints
+        .last()
+        .map_or(0, |last: &Joint| last.first_value + last.channels.len());
     joints.push(Joint {
         name,
         parent,
@@ -233,19 +310,24 @@ fn open_joint(
 }
 
 fn channels(reader: &mut Reader) -> Result<Vec<Channel>, MotionError> {
-    reader.keyword("CHANNELS")?;
     let word = reader.expected_word("a number of channels")?;
     let count: usize = word
         .parse()
         .ok()
         .filter(|count| *count <= 6)
-        .ok_or_else(|| reader.error(format!("expected 0 to 6 channels, found {word:?}")))?;
+        .ok_or_else(|| {
+            reader.error(format!(
+                "expected 0 to 6 channels, found {:?}",
+                shortened(word)
+            ))
+        })?;
     let mut channels = Vec::with_capacity(count);
     for _ in 0..count {
         let word = reader.expected_word("a channel's name")?;
         let channel = channel(word).ok_or_else(|| {
             reader.error(format!(
-                "expected a channel such as Xposition or Zrotation, found {word:?}"
+                "expected a channel such as Xposition or Zrotation, found {:?}",
+                shortened(word)
             ))
         })?;
         if channels.contains(&channel) {
@@ -272,61 +354,98 @@ fn channel(word: &str) -> Option<Channel> {
 }
 
 /// Reads `MOTION`, `Frames: n` and `Frame Time: s`; answers the number of frames and the frame rate.
-fn motion_header(reader: &mut Reader) -> Result<(usize, f64), MotionError> {
+fn motion_header(reader: &mut Reader, fps: Option<f64>) -> Result<(usize, Rate), MotionError> {
     reader.keyword("MOTION")?;
-    reader.keyword("Frames:")?;
-    let word = reader.expected_word("a number of frames")?;
-    let frames: usize = word
-        .parse()
-        .map_err(|_| reader.error(format!("expected a number of frames, found {word:?}")))?;
-    check_size(reader.path, 1.0, frames)
-        .map_err(|_| reader.error(format!("{frames} frames is no plausible number")))?;
-    reader.keyword("Frame")?;
-    reader.keyword("Time:")?;
-    let seconds = reader.number("Frame Time")?;
-    let fps = 1.0 / seconds;
-    check_size(reader.path, fps, frames).map_err(|_| {
+    let word = reader.setting("Frames")?;
+    let frames: usize = word.parse().map_err(|_| {
         reader.error(format!(
-            "a frame time of {seconds} s is not between 0.001 and 1"
+            "expected a number of frames, found {:?}",
+            shortened(word)
         ))
     })?;
-    if reader.rest.is_empty() {
-        Ok((frames, fps))
-    } else {
-        Err(reader.error("expected the end of the line after Frame Time"))
+    if frames > MAX_FRAMES {
+        return Err(reader.error(format!("{frames} frames is no plausible number")));
     }
+    let word = reader.setting("Frame Time")?;
+    let rate = match (fps, finite(word)) {
+        (Some(fps), _) => Rate::given(fps),
+        (None, Some(seconds)) => Rate::from_frame_time(seconds),
+        (None, None) => Err(format!(
+            "Frame Time: expected a finite number, found {:?}",
+            shortened(word)
+        )),
+    };
+    rate.map(|rate| (frames, rate))
+        .map_err(|reason| reader.error(reason))
 }
 
-/// Reads `frames` lines of `width` numbers; the vector grows as lines prove to be there.
-fn motion(reader: &mut Reader, frames: usize, width: usize) -> Result<Vec<f64>, MotionError> {
+/// Reads lines of `width` numbers to the end of the file; the vector grows as lines prove to be there.
+fn frame_values(
+    reader: &mut Reader,
+    announced: usize,
+    width: usize,
+    warnings: &mut Vec<String>,
+) -> Result<(Vec<f64>, usize), MotionError> {
     let mut values = Vec::new();
-    for index in 0..frames {
-        let Some(line) = reader.next_line() else {
-            return Err(reader.error(format!(
-                "the file announces {frames} frames and ends after {index}"
-            )));
-        };
-        for word in line.split_ascii_whitespace() {
-            let value = finite(word).ok_or_else(|| {
-                reader.error(format!(
-                    "frame {index}: expected a finite number, found {:?}",
-                    shortened(word)
-                ))
-            })?;
-            values.push(value);
+    let mut frames = 0;
+    let mut line = reader.next_line();
+    while let Some(text) = line {
+        if frames == MAX_FRAMES {
+            return Err(reader.error(format!("more than {MAX_FRAMES} frames")));
         }
-        let found = values.len() - index * width;
-        if found != width {
-            return Err(reader.error(format!(
-                "frame {index}: expected {width} values, found {found}"
-            )));
+        let start = values.len();
+        let number = reader.line;
+        let problem = read_frame(text, width, &mut values).err();
+        line = reader.next_line();
+        let Some(problem) = problem else {
+            frames += 1;
+            continue;
+        };
+        values.truncate(start);
+        let cut_off = line.is_none() && values_missing(text, width) && frames > 0;
+        if cut_off {
+            warnings.push(format!("line {number} is cut off and left out"));
+        } else if frames >= announced && frames > 0 {
+            warnings.push(format!(
+                "what follows the frames from line {number} on is left out"
+            ));
+            break;
+        } else {
+            return Err(MotionError::line(
+                reader.path,
+                number,
+                format!("frame {frames}: {problem}"),
+            ));
         }
     }
-    match reader.next_line() {
-        None => Ok(values),
-        Some(_) => Err(reader.error(format!(
-            "the file announces {frames} frames and goes on after them"
-        ))),
+    if frames == 0 {
+        return Err(reader.error("the file has no frames"));
+    }
+    if frames != announced {
+        warnings.push(format!(
+            "the file announces {announced} frames and has {frames}; all of them are read"
+        ));
+    }
+    Ok((values, frames))
+}
+
+/// Whether a line's numbers are right as far as they go; the last one may have been cut in two.
+fn values_missing(text: &str, width: usize) -> bool {
+    let words: Vec<&str> = text.split_ascii_whitespace().collect();
+    let whole = &words[..words.len().saturating_sub(1)];
+    words.len() <= width && whole.iter().all(|word| finite(word).is_some())
+}
+
+fn read_frame(text: &str, width: usize, values: &mut Vec<f64>) -> Result<(), String> {
+    let start = values.len();
+    for word in text.split_ascii_whitespace() {
+        let value = finite(word)
+            .ok_or_else(|| format!("expected a finite number, found {:?}", shortened(word)))?;
+        values.push(value);
+    }
+    match values.len() - start {
+        found if found == width => Ok(()),
+        found => Err(format!("expected {width} values, found {found}")),
     }
 }
 

@@ -1,256 +1,282 @@
-//! Which joints of a BVH tree are the key nodes, and how its hands are built.
+//! Which joints of a tree are the key nodes.
+//!
+//! Names are tried first where a scheme is known, since they tell left from right and a collar from an upper arm; they
+//! must describe a body (two arms that part at one joint). Where they do not, the tree's structure tells: two arms
+//! branch above a pelvis, legs below. Names given by the caller stand above both.
 
 use std::path::Path;
 
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use super::parts::{Arm, NamedTree, Skeleton, Waist};
+use super::structure;
+use super::tree::Tree;
+use crate::names::{Named, Part};
+use crate::source::unknown_mapped;
+use crate::{BodyJoint, KeyNode, MotionError, ReadOptions, Side};
 
-use super::aliases::{ARMS, ArmScheme, HIPS, SIDES, THUMB, WAIST};
-use super::parse::Joint;
-use crate::{MotionError, Side};
-
-/// Cosine of the largest angle between a T pose's arm and the line through the shoulders.
-const T_POSE: f64 = 0.87;
-/// A thumb nearer than this to the finger's direction (sine of the angle) says nothing about the hand's roll.
-const THUMB_APART: f64 = 0.25;
-
-/// The joints that carry the key nodes, as indices into the tree.
-#[derive(Debug)]
-pub(super) struct Skeleton {
-    pub(super) waist: usize,
-    /// The joint where both arms' chains part; `None` where that is the waist itself.
-    pub(super) torso: Option<usize>,
-    pub(super) arms: [Arm; 2],
-    /// Left and right hip joint.
-    pub(super) hips: Option<[usize; 2]>,
-}
-
-/// One arm's joints.
-#[derive(Debug)]
-pub(super) struct Arm {
-    pub(super) shoulder: usize,
-    pub(super) elbow: usize,
-    pub(super) wrist: usize,
-}
+/// The pelvis's names, the surest first.
+const PELVIS: [&str; 3] = ["hips", "pelvis", "hip"];
+/// A pelvis lies within this share of an arm's length from the middle of the hips.
+const NEAR_HIPS: f64 = 0.7;
+/// A torso nearer to the waist or a shoulder than this share of an arm's length makes no bone with it.
+const BONE: f64 = 0.04;
+/// The longer of two arms is at most this many times as long as the other.
+const ARMS_ALIKE: f64 = 1.5;
 
 impl Skeleton {
-    pub(super) fn find(path: &Path, joints: &[Joint]) -> Result<Self, MotionError> {
-        let names = Names::new(joints);
-        let arms = [Side::Left, Side::Right].map(|side| find_arm(&names, joints, side));
-        let [Some(left), Some(right)] = arms else {
-            let side = if arms[0].is_none() { "left" } else { "right" };
-            let known: Vec<&str> = joints
-                .iter()
-                .map(|j| j.name.as_str())
-                .filter(|n| !n.is_empty())
-                .take(40)
-                .collect();
-            let reason = format!(
-                "no known names for the {side} shoulder and elbow among the joints {}",
-                known.join(", ")
-            );
-            return Err(MotionError::format(path, reason));
+    pub(super) fn find(
+        path: &Path,
+        tree: &NamedTree,
+        options: &ReadOptions,
+        warnings: &mut Vec<String>,
+    ) -> Result<Self, MotionError> {
+        let map = Map::new(path, tree.tree, options)?;
+        let joints = tree.tree.joints;
+        let roots: Vec<usize> = (0..joints.len())
+            .filter(|j| joints[*j].parent.is_none())
+            .collect();
+        let found = roots
+            .iter()
+            .find_map(|root| Self::in_tree(tree, *root, &map));
+        let Some(skeleton) = found else {
+            return Err(unknown_skeleton(path, tree));
         };
-        let waist = WAIST.iter().find_map(|name| names.find(name)).unwrap_or(0);
-        let torso = common_ancestor(joints, left.shoulder, right.shoulder).filter(|torso| {
-            *torso != waist && ancestors(joints, *torso).any(|joint| joint == waist)
+        if roots.len() > 1 {
+            warnings.push(format!(
+                "{} roots: {} is read, the others are left out",
+                roots.len(),
+                joints[skeleton.root].name
+            ));
+        }
+        if skeleton.by_structure {
+            warnings.push("the names are of no known scheme: the joints are told by the tree's structure; check them, or use --map".to_owned());
+        }
+        Ok(skeleton)
+    }
+
+    fn in_tree(tree: &NamedTree, root: usize, map: &Map) -> Option<Self> {
+        let inside = |joint: usize| joint == root || tree.tree.is_below(joint, root);
+        let body = structure::body(tree, root);
+        let by_name = Side::BOTH.map(|side| named_arm(tree, root, side));
+        let by_structure = body.as_ref().map(|body| body.arms);
+        let names_tell = match by_name {
+            [Some(left), Some(right)] => arms_make_a_body(tree.tree, &[left, right]),
+            _ => false,
+        };
+        let arms = Side::BOTH.map(|side| {
+            let found = if names_tell {
+                by_name[side as usize]
+            } else {
+                by_structure.map(|arms| arms[side as usize])
+            };
+            map.arm(side, found)
         });
-        let hips = [Side::Left, Side::Right]
-            .map(|side| HIPS.iter().find_map(|name| names.find_sided(name, side)));
-        let hips = if let [Some(l), Some(r)] = hips {
+        let [Some(left), Some(right)] = arms else {
+            return None;
+        };
+        if ![left, right].iter().all(|arm| inside(arm.shoulder)) {
+            return None;
+        }
+        let legs = Side::BOTH.map(|side| {
+            let hip = map
+                .get(BodyJoint::Hip(side))
+                .or_else(|| named_hip(tree, root, side));
+            hip.or_else(|| Some(body.as_ref()?.hips?[side as usize]))
+        });
+        let hips = if let [Some(l), Some(r)] = legs {
             Some([l, r])
         } else {
             None
         };
-        Ok(Self {
+        let arms = [left, right];
+        let waist = map
+            .get(BodyJoint::Node(KeyNode::Waist))
+            .map(Waist::Joint)
+            .unwrap_or_else(|| find_waist(tree, root, &arms, hips));
+        let torso = map
+            .get(BodyJoint::Node(KeyNode::Torso))
+            .or_else(|| find_torso(tree.tree, waist, &arms));
+        let joints = hips.map(|hips| hips.map(|hip| structure::leg(tree, hip)));
+        Some(Self {
+            root,
             waist,
             torso,
-            arms: [left, right],
+            arms,
             hips,
+            legs: joints.and_then(|[l, r]| Some([l?, r?])),
+            by_structure: !(names_tell || map.has_arms()),
         })
     }
 }
 
-/// Joint names in the form the alias table has.
-struct Names {
-    plain: Vec<String>,
-    without_prefix: Vec<String>,
-}
+/// The joints that the caller names.
+struct Map(Vec<(BodyJoint, usize)>);
 
-impl Names {
-    fn new(joints: &[Joint]) -> Self {
-        let plain: Vec<String> = joints.iter().map(|joint| simplified(&joint.name)).collect();
-        let prefix = common_prefix(plain.iter().filter(|name| !name.is_empty()));
-        let without_prefix = plain
+impl Map {
+    fn new(path: &Path, tree: &Tree, options: &ReadOptions) -> Result<Self, MotionError> {
+        let names = || tree.joints.iter().map(|joint| joint.name.as_str());
+        let find = |(key, name): &(BodyJoint, String)| {
+            let index = names().position(|other| other == name.as_str());
+            index
+                .map(|index| (*key, index))
+                .ok_or_else(|| unknown_mapped(path, *key, name, names()))
+        };
+        options
+            .map
             .iter()
-            .map(|name| name.get(prefix..).unwrap_or("").to_owned())
-            .collect();
-        Self {
-            plain,
-            without_prefix,
-        }
+            .map(find)
+            .collect::<Result<_, _>>()
+            .map(Self)
     }
 
-    fn find(&self, alias: &str) -> Option<usize> {
-        let position = |names: &[String]| names.iter().position(|name| name == alias);
-        position(&self.plain).or_else(|| position(&self.without_prefix))
+    fn get(&self, joint: BodyJoint) -> Option<usize> {
+        let entry = self.0.iter().rev().find(|(key, _)| *key == joint);
+        entry.map(|(_, index)| *index)
     }
 
-    fn find_sided(&self, alias: &str, side: Side) -> Option<usize> {
-        let bare = alias.trim_start_matches('@');
-        SIDES[side as usize].iter().find_map(|word| {
-            self.find(&format!("{word}{bare}"))
-                .or_else(|| self.find(&format!("{bare}{word}")))
+    fn node(&self, node: KeyNode) -> Option<usize> {
+        self.get(BodyJoint::Node(node))
+    }
+
+    fn arm(&self, side: Side, found: Option<Arm>) -> Option<Arm> {
+        let [shoulder, elbow, wrist] = side.arm().map(|node| self.node(node));
+        Some(Arm {
+            shoulder: shoulder.or(found.map(|arm| arm.shoulder))?,
+            elbow: elbow.or(found.map(|arm| arm.elbow))?,
+            wrist: wrist.or(found.map(|arm| arm.wrist))?,
         })
     }
-}
 
-/// Lower case, letters and digits only, without a namespace.
-fn simplified(name: &str) -> String {
-    let bare = name.rsplit(':').next().unwrap_or(name);
-    bare.chars()
-        .filter(char::is_ascii_alphanumeric)
-        .map(|c| c.to_ascii_lowercase())
-        .collect()
-}
-
-/// Length of the prefix that all names share; they are ASCII.
-fn common_prefix<'a>(mut names: impl Iterator<Item = &'a String>) -> usize {
-    let Some(first) = names.next() else { return 0 };
-    names.fold(first.len(), |length, name| {
-        first
-            .bytes()
-            .zip(name.bytes())
-            .take(length)
-            .take_while(|(a, b)| a == b)
-            .count()
-    })
-}
-
-fn find_arm(names: &Names, joints: &[Joint], side: Side) -> Option<Arm> {
-    ARMS.iter()
-        .find_map(|scheme| match_scheme(names, joints, scheme, side))
-}
-
-fn match_scheme(names: &Names, joints: &[Joint], scheme: &ArmScheme, side: Side) -> Option<Arm> {
-    let shoulder = names.find_sided(scheme.shoulder, side)?;
-    let elbow = names.find_sided(scheme.elbow, side)?;
-    let below = |joint: usize, ancestor: usize| ancestors(joints, joint).any(|j| j == ancestor);
-    if !below(elbow, shoulder) {
-        return None;
+    fn has_arms(&self) -> bool {
+        Side::BOTH
+            .iter()
+            .all(|side| side.arm().iter().all(|node| self.node(*node).is_some()))
     }
-    let named = scheme
-        .wrist
-        .iter()
-        .find_map(|name| names.find_sided(name, side));
-    let wrist = named
-        .filter(|wrist| below(*wrist, elbow))
-        .or_else(|| children(joints, elbow).next())?;
-    Some(Arm {
-        shoulder,
-        elbow,
-        wrist,
-    })
 }
 
-/// The joints above `joint`, nearest first.
-fn ancestors(joints: &[Joint], joint: usize) -> impl Iterator<Item = usize> {
-    std::iter::successors(joints[joint].parent, |joint| joints[*joint].parent)
-}
-
-fn children(joints: &[Joint], parent: usize) -> impl Iterator<Item = usize> {
-    (0..joints.len()).filter(move |joint| joints[*joint].parent == Some(parent))
-}
-
-fn common_ancestor(joints: &[Joint], a: usize, b: usize) -> Option<usize> {
-    ancestors(joints, a).find(|joint| ancestors(joints, b).any(|other| other == *joint))
-}
-
-/// Position of every joint with all rotations zero, file units, root at the origin.
-pub(super) fn rest_positions(joints: &[Joint]) -> Vec<Vector3<f64>> {
-    let mut positions: Vec<Vector3<f64>> = Vec::with_capacity(joints.len());
-    for joint in joints {
-        let parent = joint
-            .parent
-            .map_or_else(Vector3::zeros, |parent| positions[parent]);
-        positions.push(parent + joint.offset);
-    }
-    positions
-}
-
-/// Turns a hand joint's frame into the hand convention (x to the fingers, z to the thumb), by the rest pose: the
-/// fingers from the hand's (or forearm's) bone; the thumb from a thumb joint or, where there is none and the arm is
-/// stretched sideways as in a T pose, forward. `None` where the wrist has no rotation of its own or the rest pose
-/// does not tell.
-pub(super) fn hand_frame(
-    joints: &[Joint],
-    skeleton: &Skeleton,
-    rest: &[Vector3<f64>],
-    side: Side,
-) -> Option<Rotation3<f64>> {
-    let arm = &skeleton.arms[side as usize];
-    if !joints[arm.wrist].rotates() {
-        return None;
-    }
-    let fingers = finger_direction(joints, rest, arm)?;
-    let thumb = thumb_direction(joints, rest, arm, &fingers)
-        .or_else(|| t_pose_forward(skeleton, rest, arm, side))?;
-    let x = fingers;
-    let z = (thumb - x * x.dot(&thumb)).try_normalize(1e-6)?;
-    Some(Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[
-        x,
-        z.cross(&x),
-        z,
-    ])))
-}
-
-/// Descendants of `joint`, nearest first along the file's order.
-fn descendants(joints: &[Joint], joint: usize) -> impl Iterator<Item = usize> {
-    (joint + 1..joints.len()).filter(move |other| ancestors(joints, *other).any(|a| a == joint))
-}
-
-fn is_thumb(joints: &[Joint], joint: usize) -> bool {
-    let named = |j: usize| simplified(&joints[j].name).contains(THUMB);
-    named(joint) || ancestors(joints, joint).any(named)
-}
-
-fn finger_direction(joints: &[Joint], rest: &[Vector3<f64>], arm: &Arm) -> Option<Vector3<f64>> {
-    let wrist = rest[arm.wrist];
-    let forearm = wrist - rest[arm.elbow];
-    let apart = 0.02 * forearm.norm();
-    descendants(joints, arm.wrist)
-        .filter(|joint| !is_thumb(joints, *joint))
-        .find_map(|joint| (rest[joint] - wrist).try_normalize(apart))
-        .or_else(|| forearm.try_normalize(1e-9))
-}
-
-fn thumb_direction(
-    joints: &[Joint],
-    rest: &[Vector3<f64>],
-    arm: &Arm,
-    fingers: &Vector3<f64>,
-) -> Option<Vector3<f64>> {
-    descendants(joints, arm.wrist)
-        .filter(|joint| is_thumb(joints, *joint))
-        .find_map(|joint| {
-            let direction = (rest[joint] - rest[arm.wrist]).try_normalize(1e-9)?;
-            (direction.cross(fingers).norm() > THUMB_APART).then_some(direction)
-        })
-}
-
-fn t_pose_forward(
-    skeleton: &Skeleton,
-    rest: &[Vector3<f64>],
-    arm: &Arm,
-    side: Side,
-) -> Option<Vector3<f64>> {
-    let [left, right] = skeleton.arms.each_ref().map(|a| rest[a.shoulder]);
-    let to_left = (left - right).try_normalize(1e-9)?;
-    let up = ((left + right) * 0.5 - rest[skeleton.waist]).try_normalize(1e-9)?;
-    let outward = if side == Side::Left {
-        to_left
-    } else {
-        -to_left
+fn unknown_skeleton(path: &Path, tree: &NamedTree) -> MotionError {
+    let missing = Side::BOTH.map(|side| named_arm(tree, 0, side).is_none());
+    let side = match missing {
+        [true, false] => "left ",
+        [false, true] => "right ",
+        _ => "",
     };
-    let stretched = (rest[arm.wrist] - rest[arm.shoulder]).try_normalize(1e-9)?;
-    (stretched.dot(&outward) > T_POSE).then(|| to_left.cross(&up))
+    let known: Vec<&str> = tree
+        .tree
+        .joints
+        .iter()
+        .map(|j| j.name.as_str())
+        .filter(|n| !n.is_empty())
+        .take(40)
+        .collect();
+    let reason = format!(
+        "neither names nor structure tell the {side}shoulder and elbow among the joints {}; --map left_elbow=NAME gives them",
+        known.join(", ")
+    );
+    MotionError::format(path, reason)
+}
+
+/// The joints at and below a root in the file's order.
+fn inside<'a>(tree: &'a NamedTree, root: usize) -> impl Iterator<Item = usize> + use<'a> {
+    std::iter::once(root).chain(tree.tree.descendants(root))
+}
+
+fn named_arm(tree: &NamedTree, root: usize, side: Side) -> Option<Arm> {
+    inside(tree, root)
+        .filter(|joint| tree.is(*joint, side, &[Part::Elbow]))
+        .find_map(|elbow| {
+            let above = |part: Part| {
+                let line = tree.tree.ancestors(elbow);
+                line.filter(move |joint| tree.is(*joint, side, &[part]))
+            };
+            // An upper arm of several joints begins with the topmost, a shoulder beside a collar is the lower one.
+            let shoulder = above(Part::UpperArm)
+                .last()
+                .or_else(|| above(Part::Shoulder).next())?;
+            let wrist = tree
+                .tree
+                .descendants(elbow)
+                .find(|joint| tree.is(*joint, side, &[Part::Wrist, Part::Hand]))
+                .or_else(|| longest_child(tree.tree, elbow))?;
+            Some(Arm {
+                shoulder,
+                elbow,
+                wrist,
+            })
+        })
+}
+
+/// The child at the end of the longest bone; the first of equal ones.
+fn longest_child(tree: &Tree, joint: usize) -> Option<usize> {
+    tree.children(joint)
+        .iter()
+        .copied()
+        .reduce(|longest, child| {
+            let longer = tree.offsets[child].norm() > tree.offsets[longest].norm() * (1.0 + 1e-6);
+            if longer { child } else { longest }
+        })
+}
+
+/// Whether both arms branch from one joint and are about as long.
+fn arms_make_a_body(tree: &Tree, arms: &[Arm; 2]) -> bool {
+    let [left, right] = arms;
+    let apart =
+        left.shoulder != right.shoulder && tree.meeting(left.shoulder, right.shoulder).is_some();
+    let [a, b] = arms.map(|arm| tree.path(arm.shoulder, arm.wrist));
+    apart && a > 0.0 && b > 0.0 && a.max(b) <= ARMS_ALIKE * a.min(b)
+}
+
+fn named_hip(tree: &NamedTree, root: usize, side: Side) -> Option<usize> {
+    inside(tree, root)
+        .find(|joint| tree.is(*joint, side, &[Part::Thigh]))
+        .or_else(|| inside(tree, root).find(|joint| tree.is(*joint, side, &[Part::Leg])))
+}
+
+fn find_waist(tree: &NamedTree, root: usize, arms: &[Arm; 2], hips: Option<[usize; 2]>) -> Waist {
+    let arm = tree.tree.path(arms[0].shoulder, arms[0].wrist);
+    let rest = &tree.tree.rest;
+    let middle = hips.map(|[l, r]| (rest[l] + rest[r]) * 0.5);
+    let at_hips =
+        |joint: usize| middle.is_none_or(|middle| (rest[joint] - middle).norm() < NEAR_HIPS * arm);
+    let named = PELVIS.iter().find_map(|word| {
+        inside(tree, root).find(|joint| {
+            let Named { side, part } = tree.names[*joint];
+            let name = tree.tree.joints[*joint].name.to_lowercase();
+            side.is_none() && part == Some(Part::Pelvis) && name.contains(word) && at_hips(*joint)
+        })
+    });
+    let named = named.or_else(|| {
+        inside(tree, root).find(|joint| {
+            let Named { side, part } = tree.names[*joint];
+            side.is_none() && part == Some(Part::Pelvis) && at_hips(*joint)
+        })
+    });
+    let meeting = || {
+        let [l, r] = hips?;
+        let legs = tree.tree.meeting(l, r)?;
+        let trunk = tree.tree.meeting(arms[0].shoulder, arms[1].shoulder)?;
+        let joint = tree.tree.meeting(legs, trunk)?;
+        Some(if at_hips(joint) {
+            Waist::Joint(joint)
+        } else {
+            Waist::BetweenHips
+        })
+    };
+    named
+        .map(Waist::Joint)
+        .or_else(meeting)
+        .unwrap_or(Waist::Joint(root))
+}
+
+fn find_torso(tree: &Tree, waist: Waist, arms: &[Arm; 2]) -> Option<usize> {
+    let [left, right] = arms;
+    let torso = tree
+        .ancestors(left.shoulder)
+        .find(|joint| tree.is_below(right.shoulder, *joint))?;
+    let bone = BONE * tree.path(left.shoulder, left.wrist);
+    let apart = |joint: usize| (tree.rest[joint] - tree.rest[torso]).norm() > bone;
+    let above = match waist {
+        Waist::Joint(waist) => tree.is_below(torso, waist) && apart(waist),
+        Waist::BetweenHips => true,
+    };
+    (above && apart(left.shoulder) && apart(right.shoulder)).then_some(torso)
 }

@@ -27,7 +27,7 @@ pub fn library(
     let skills: Vec<_> = skills::library(seed, procedural)
         .iter()
         .map(|clip| clip.resampled(data::RATE))
-        .collect();
+        .collect::<Result<_, _>>()?;
     let retargeted = |motion: &[emp_motion::Clip], source| {
         GoalClip::retargeted(retargeter, motion, source, threads).context("retargeting the motions")
     };

@@ -30,7 +30,9 @@ pub fn load_clips(folders: &[PathBuf]) -> Result<Vec<Clip>> {
             "{}: expected motion files (.bvh, .npz), found none",
             folder.display()
         );
-        clips.extend(found.iter().map(|clip| clip.resampled(RATE)));
+        for clip in &found {
+            clips.push(clip.resampled(RATE).with_context(|| clip.name.clone())?);
+        }
     }
     Ok(clips)
 }

@@ -1,4 +1,4 @@
-//! The AMASS reader answers any archive, and any `poses` array in an archive that is right otherwise.
+//! The SMPL family's reader answers any archive, and any `poses` array in an archive that is right otherwise.
 #![no_main]
 
 #[path = "../src/archive.rs"]
@@ -6,7 +6,7 @@ mod archive;
 
 use std::path::Path;
 
-use emp_motion::amass;
+use emp_motion::{ReadOptions, smpl};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|data: &[u8]| {
@@ -21,7 +21,8 @@ fuzz_target!(|data: &[u8]| {
 });
 
 fn check(archive: &[u8]) {
-    if let Ok(clip) = amass::from_bytes(Path::new("fuzz.npz"), archive) {
-        assert_eq!(clip.validate(), Ok(()));
+    let read = smpl::from_bytes(Path::new("fuzz.npz"), archive, &ReadOptions::default());
+    if let Ok(reading) = read {
+        assert_eq!(reading.clip.validate(), Ok(()));
     }
 }

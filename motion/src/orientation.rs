@@ -1,0 +1,221 @@
+//! Which axis of a file points up, whether the file holds a mirror image, and how tall its person is.
+//!
+//! Nothing of that stands in most files. The body tells it: the trunk is above the feet, the lowest point of a pose
+//! rests on the floor at zero, toes point forward, knees bend forward and elbows backward.
+
+use nalgebra::Vector3;
+
+use crate::{KEY_NODES, KeyNode, Side, UpAxis};
+
+/// What a pose's legs say next to its legs' weight of 1, where the file has legs.
+const TRUNK_WEIGHT: f64 = 0.5;
+/// The trunk's weight where it is alone.
+const TRUNK_ALONE_WEIGHT: f64 = 1.5;
+/// Weight of the rest pose, which in some files keeps another axis up than the motion.
+const REST_WEIGHT: f64 = 0.75;
+/// Weight of the share of poses that stand on a floor at zero.
+const FLOOR_WEIGHT: f64 = 1.0;
+/// Weight of the axis that a format prescribes or its files say.
+const PRIOR_WEIGHT: f64 = 0.75;
+/// The floor lies within this share of a body's size from zero, …
+const FLOOR_BAND: f64 = 0.04;
+/// … and the waist at least this share above it.
+const WAIST_ABOVE_FLOOR: f64 = 0.08;
+/// Two axes whose scores are nearer than this are both likely.
+const CLEAR_LEAD: f64 = 0.3;
+/// Cosine between trunk and legs above which a rest pose stands upright.
+const UPRIGHT: f64 = 0.8;
+/// A limb whose middle joint is off the straight line by this share of its length is bent.
+const BENT: f64 = 0.08;
+/// Least number of limbs and poses that must show a direction.
+const LEAST_SHOWS: usize = 2;
+/// A body whose signs add up to less is its own mirror image.
+const MIRRORED_BELOW: f64 = -0.4;
+
+/// One pose with what tells its orientation; file units and axes.
+#[derive(Clone, Debug)]
+pub(crate) struct Probe {
+    pub(crate) positions: [Vector3<f64>; KEY_NODES],
+    /// From the right hip to the left one (shoulders where there are no hips).
+    pub(crate) left: Vector3<f64>,
+    pub(crate) legs: Option<[Leg; 2]>,
+    /// Least and greatest coordinates of all joints.
+    pub(crate) bounds: [Vector3<f64>; 2],
+    /// The same without the arms.
+    pub(crate) height_bounds: Option<[Vector3<f64>; 2]>,
+}
+
+/// One leg of a pose.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Leg {
+    pub(crate) hip: Vector3<f64>,
+    pub(crate) knee: Vector3<f64>,
+    pub(crate) ankle: Vector3<f64>,
+    pub(crate) toe: Option<Vector3<f64>>,
+}
+
+impl Probe {
+    fn shoulders(&self) -> Vector3<f64> {
+        let node = |n: KeyNode| self.positions[n as usize];
+        (node(KeyNode::LeftShoulder) + node(KeyNode::RightShoulder)) * 0.5
+    }
+
+    fn waist(&self) -> Vector3<f64> {
+        self.positions[KeyNode::Waist as usize]
+    }
+
+    /// From the ankles to the waist.
+    fn leg_line(&self) -> Option<Vector3<f64>> {
+        let [left, right] = self.legs.as_ref()?;
+        Some(self.waist() - (left.ankle + right.ankle) * 0.5)
+    }
+
+    /// Along the trunk and the legs, whatever the pose.
+    fn size(&self) -> f64 {
+        let trunk = (self.shoulders() - self.waist()).norm();
+        trunk + self.leg_line().map_or(trunk, |line| line.norm())
+    }
+
+    fn forward(&self, up: &Vector3<f64>) -> Option<Vector3<f64>> {
+        self.left.cross(up).try_normalize(0.2 * self.left.norm())
+    }
+}
+
+/// Lowest and highest coordinates of some points.
+pub(crate) fn bounds(points: impl Iterator<Item = Vector3<f64>>) -> Option<[Vector3<f64>; 2]> {
+    points.fold(None, |bounds, p| {
+        let [low, high] = bounds.unwrap_or([p, p]);
+        Some([low.inf(&p), high.sup(&p)])
+    })
+}
+
+/// The axis that points up, and a warning where a second one is nearly as likely.
+pub(crate) fn up_axis(
+    probes: &[Probe],
+    rest: Option<&Probe>,
+    prior: Option<UpAxis>,
+) -> (UpAxis, Option<String>) {
+    let mut scored = UpAxis::ALL.map(|axis| {
+        let told = if prior == Some(axis) {
+            PRIOR_WEIGHT
+        } else {
+            0.0
+        };
+        (score(axis, probes, rest) + told, axis)
+    });
+    scored.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let [(first, up), (second, other), ..] = scored;
+    let unsure = (first - second < CLEAR_LEAD)
+        .then(|| format!("{up} is taken as up, but {other} is nearly as likely: --up tells"));
+    (up, unsure)
+}
+
+fn score(axis: UpAxis, probes: &[Probe], rest: Option<&Probe>) -> f64 {
+    let up = axis.direction();
+    let along = |v: Vector3<f64>| v.try_normalize(1e-9).map_or(0.0, |v| v.dot(&up));
+    let trunk = mean(probes.iter().map(|p| along(p.shoulders() - p.waist())));
+    let legs: Option<f64> = probes
+        .iter()
+        .map(|p| p.leg_line().map(along))
+        .collect::<Option<Vec<f64>>>()
+        .map(|legs| mean(legs.into_iter()));
+    let stands = match legs {
+        Some(legs) => legs + TRUNK_WEIGHT * trunk,
+        None => TRUNK_ALONE_WEIGHT * trunk,
+    };
+    let rest = rest.and_then(rest_line).map_or(0.0, along);
+    let floor = mean(probes.iter().map(|p| f64::from(u8::from(on_floor(p, &up)))));
+    let tilt = mean(probes.iter().map(|p| along(p.left).abs()));
+    stands + REST_WEIGHT * rest.max(0.0) + FLOOR_WEIGHT * floor - tilt
+}
+
+/// The direction of a rest pose that stands upright.
+fn rest_line(rest: &Probe) -> Option<Vector3<f64>> {
+    let trunk = (rest.shoulders() - rest.waist()).try_normalize(1e-9)?;
+    let Some(legs) = rest.leg_line() else {
+        return Some(trunk);
+    };
+    (legs.try_normalize(1e-9)?.dot(&trunk) > UPRIGHT).then_some(trunk)
+}
+
+fn on_floor(probe: &Probe, up: &Vector3<f64>) -> bool {
+    let [low, high] = probe.bounds;
+    let lowest = up.dot(&low).min(up.dot(&high));
+    let size = probe.size();
+    lowest.abs() < FLOOR_BAND * size && up.dot(&probe.waist()) - lowest > WAIST_ABOVE_FLOOR * size
+}
+
+/// Whether the body is its own mirror image; `None` where neither legs nor arms tell.
+/// `thumbs` is how far the thumbs point forward at rest, −1 to 1.
+pub(crate) fn is_mirrored(
+    probes: &[Probe],
+    rest: Option<&Probe>,
+    up: UpAxis,
+    thumbs: Option<f64>,
+) -> Option<bool> {
+    let up = up.direction();
+    let poses = || probes.iter().chain(rest);
+    let legs = |p: &Probe| p.legs.iter().flatten().copied().collect::<Vec<Leg>>();
+    let toes = sign(poses().flat_map(|p| {
+        let toe = |leg: &Leg| Some(level(leg.toe? - leg.ankle, &up)?.dot(&p.forward(&up)?));
+        legs(p).iter().filter_map(toe).collect::<Vec<f64>>()
+    }));
+    let knees = sign(probes.iter().flat_map(|p| {
+        let knee = |leg: &Leg| Some(bend(leg.hip, leg.knee, leg.ankle)?.dot(&p.forward(&up)?));
+        legs(p).iter().filter_map(knee).collect::<Vec<f64>>()
+    }));
+    let elbows = sign(probes.iter().flat_map(|p| {
+        let elbow = |side: Side| {
+            let [shoulder, elbow, wrist] = side.arm().map(|node| p.positions[node as usize]);
+            // A raised arm may bend any way.
+            let hangs = (elbow - shoulder).dot(&up) < 0.0;
+            let bend = hangs.then(|| bend(shoulder, elbow, wrist))??;
+            Some(-bend.dot(&p.forward(&up)?))
+        };
+        Side::BOTH
+            .into_iter()
+            .filter_map(elbow)
+            .collect::<Vec<f64>>()
+    }));
+    let signs = [(toes, 2.0), (knees, 1.5), (thumbs, 1.0), (elbows, 0.75)];
+    let (sum, weight) = signs
+        .into_iter()
+        .filter_map(|(sign, weight)| Some((sign? * weight, weight)))
+        .fold((0.0, 0.0), |(s, w), (sign, weight)| (s + sign, w + weight));
+    (weight > 0.0).then(|| sum / weight < MIRRORED_BELOW)
+}
+
+/// The mean of what limbs and poses show, where enough of them show it.
+fn sign(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let values: Vec<f64> = values.collect();
+    (values.len() >= LEAST_SHOWS).then(|| mean(values.iter().copied()))
+}
+
+/// The horizontal direction of a foot that is not on its tip.
+fn level(v: Vector3<f64>, up: &Vector3<f64>) -> Option<Vector3<f64>> {
+    (v - up * up.dot(&v)).try_normalize(0.3 * v.norm().max(1e-9))
+}
+
+/// Where the middle joint of a bent limb points.
+fn bend(a: Vector3<f64>, middle: Vector3<f64>, b: Vector3<f64>) -> Option<Vector3<f64>> {
+    let line = (b - a).try_normalize(1e-9)?;
+    let off = (middle - a) - line * line.dot(&(middle - a));
+    let length = (middle - a).norm() + (b - middle).norm();
+    off.try_normalize(BENT * length)
+}
+
+/// How tall the person is in file units: what most poses reach, arms aside.
+pub(crate) fn height(probes: &[Probe], up: UpAxis) -> Option<f64> {
+    let up = up.direction().abs();
+    let mut heights: Vec<f64> = probes
+        .iter()
+        .map(|p| p.height_bounds.map(|[low, high]| up.dot(&(high - low))))
+        .collect::<Option<_>>()?;
+    heights.sort_by(f64::total_cmp);
+    heights.get(heights.len() * 9 / 10).copied()
+}
+
+pub(crate) fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0), |(s, n), v| (s + v, n + 1.0));
+    sum / count
+}

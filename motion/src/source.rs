@@ -9,7 +9,7 @@ use crate::options::{UNIT_NAMES, UpAxis};
 use crate::orientation::{self, Probe, mean};
 use crate::understanding::{NodeJoint, Reading, Understanding};
 use crate::world_frame::WorldFrame;
-use crate::{BodyJoint, Clip, KEY_NODES, KeyNode, KeyNodeFrame, MotionError, ReadOptions, Side};
+use crate::{BodyJoint, Clip, KeyNode, KeyNodeFrame, MotionError, ReadOptions, Side};
 
 /// No motion file holds more frames than this (over an hour at 120 frames a second).
 pub(crate) const MAX_FRAMES: usize = 500_000;

@@ -191,7 +191,7 @@ fn every_name_and_shape_of_the_family_gives_the_same_motion() {
 
 #[test]
 fn any_axis_of_a_smpl_world_may_point_up() {
-    let expected = read_smpl(&smpl_h(&[smpl_pose(0.3, 18, Vector3::y()); 3])).expect("valid");
+    let expected = read_smpl(&smpl_h(&vec![smpl_pose(0.3, 18, Vector3::y()); 3])).expect("valid");
     // From the z-up world to others, and the pelvis 0.95 m over a floor at zero.
     let worlds = [
         ("y", Vector3::x() * -std::f64::consts::FRAC_PI_2),

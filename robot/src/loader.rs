@@ -44,6 +44,7 @@ pub(crate) fn find(
     let attached = loader.attached(base, &joints, feet)?;
     loader.check_masses()?;
     loader.check_imu()?;
+    loader.check_state(&joints)?;
     Ok(Found {
         base,
         joints,
@@ -331,6 +332,48 @@ impl Loader<'_> {
                 let found = format!("{mass} of body {:?}", body_name(self.model, body));
                 return Err(self.error("model", "bodies with finite masses", found));
             }
+        }
+        Ok(())
+    }
+
+    /// The state and the controls are the base's and the joints', in their order: whatever else a model has would shift them.
+    fn check_state(&self, joints: &Joints) -> Result<(), RobotError> {
+        let model = self.model;
+        let names = joints
+            .goal
+            .iter()
+            .chain(&joints.leg)
+            .map(|joint| joint.name.as_str());
+        let expected: Vec<Option<&str>> = names.map(Some).collect();
+        let count = model.actuator_trntype().len();
+        let actuators: Vec<Option<&str>> = (0..count)
+            .map(|id| model.id_to_name(MjtObjBase::mjOBJ_ACTUATOR, id))
+            .collect();
+        if actuators != expected {
+            let found = format!(
+                "{count} actuators, {:?} …",
+                actuators.iter().take(3).collect::<Vec<_>>()
+            );
+            return Err(self.error(
+                "joints",
+                "one actuator a joint, in the joints' order",
+                found,
+            ));
+        }
+        let sizes = [
+            model.ffi().nq,
+            model.ffi().nv,
+            model.ffi().na,
+            model.ffi().nmocap,
+        ];
+        let joints = expected.len() as i64;
+        let wanted = [7 + joints, 6 + joints, 0, 0];
+        if sizes != wanted {
+            return Err(self.error(
+                "model",
+                format!("nq, nv, na, nmocap of {wanted:?}: one floating base and hinges"),
+                format!("{sizes:?}"),
+            ));
         }
         Ok(())
     }

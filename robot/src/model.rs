@@ -26,17 +26,26 @@ pub(crate) struct Files<'a> {
     pub(crate) model: &'a Path,
 }
 
-/// Compiles the MJCF: locked joints removed, joint properties, position actuators (in the order goal joints, leg
-/// joints; named like their joints), foot spheres, contact pairs and a floor added, all other contacts off.
+/// A compiled model, and what of the MJCF was left out.
+pub(crate) struct Compiled {
+    pub(crate) model: MjModel,
+    /// Counts in words, such as `23 actuators`.
+    pub(crate) left_out: Vec<String>,
+}
+
+/// Compiles the MJCF: what belongs to another way of driving it left out, locked joints removed, joint properties,
+/// position actuators (in the order goal joints, leg joints; named like their joints), foot spheres, contact pairs and a
+/// floor added, all other contacts off.
 pub(crate) fn compile(
     files: &Files<'_>,
     config: &Config,
     shapes: Shapes,
-) -> Result<MjModel, RobotError> {
+) -> Result<Compiled, RobotError> {
     let mut edit = Edit {
         files,
         spec: open(files, config)?,
     };
+    let left_out = edit.leave_out()?;
     edit.options(config);
     edit.lock(&config.joints.locked)?;
     edit.joints(config)?;
@@ -49,9 +58,11 @@ pub(crate) fn compile(
     edit.spec
         .compiler_mut()
         .set_discardvisual(shapes == Shapes::Physical);
-    edit.spec
+    let model = edit
+        .spec
         .compile()
-        .map_err(|error| RobotError::mujoco(files.model, error))
+        .map_err(|error| RobotError::mujoco(files.model, error))?;
+    Ok(Compiled { model, left_out })
 }
 
 fn open(files: &Files<'_>, config: &Config) -> Result<MjSpec, RobotError> {
@@ -97,6 +108,37 @@ impl Edit<'_> {
     fn missing(&self, key: &str, what: &str, name: &str) -> RobotError {
         let expected = format!("{what} of {}", self.files.model.display());
         RobotError::value(self.files.config, key, expected, format!("{name:?}"))
+    }
+
+    /// Deletes what the model has for other users: its own actuators, sensors, keyframes, cameras and contact pairs.
+    /// `robot.toml` says how the robot is driven and what touches.
+    fn leave_out(&mut self) -> Result<Vec<String>, RobotError> {
+        let mut left_out = Vec::new();
+        macro_rules! delete_all {
+            ($($elements:ident: $one:literal, $many:literal;)*) => {$(
+                let mut count = 0;
+                while let Some(element) = self.spec.$elements().next() {
+                    // SAFETY: the handle comes from the spec just now and ends here.
+                    unsafe { element.delete() }
+                        .map_err(|error| RobotError::mujoco(self.files.model, error))?;
+                    count += 1;
+                }
+                match count {
+                    0 => {}
+                    1 => left_out.push(format!("1 {}", $one)),
+                    _ => left_out.push(format!("{count} {}", $many)),
+                }
+            )*};
+        }
+        delete_all! {
+            sensor_iter_mut: "sensor", "sensors";
+            key_iter_mut: "keyframe", "keyframes";
+            actuator_iter_mut: "actuator", "actuators";
+            camera_iter_mut: "camera", "cameras";
+            pair_iter_mut: "contact pair", "contact pairs";
+            exclude_iter_mut: "contact exclusion", "contact exclusions";
+        }
+        Ok(left_out)
     }
 
     fn options(&mut self, config: &Config) {

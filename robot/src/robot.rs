@@ -11,7 +11,7 @@ use crate::joint::{GoalNode, Joint};
 use crate::key_nodes::{KEY_NODE_NAMES, KeyNodeSite};
 use crate::kinematics::Kinematics;
 use crate::loader::{self, Found, Joints};
-use crate::model::{self, Files, Shapes};
+use crate::model::{self, Compiled, Files, Shapes};
 use crate::{RobotError, goal_tree};
 
 /// The file in a robot's folder that describes it.
@@ -73,7 +73,15 @@ impl Robot {
             config: &config_file,
             model: &model_file,
         };
-        let model = model::compile(&files, &config, Shapes::Physical)?;
+        let Compiled { model, left_out } = model::compile(&files, &config, Shapes::Physical)?;
+        if !left_out.is_empty() {
+            let left_out = left_out.join(", ");
+            tracing::info!(
+                robot = config.name,
+                "left out of {}: {left_out}",
+                model_file.display()
+            );
+        }
         let feet = config.contacts.feet().map(|(_, config)| foot(config));
         let Found {
             base,
@@ -255,7 +263,7 @@ impl Robot {
             config: &self.config_file,
             model: &self.model_file,
         };
-        model::compile(&files, &self.config, Shapes::All)
+        model::compile(&files, &self.config, Shapes::All).map(|compiled| compiled.model)
     }
 
     /// The `robot.toml`, which errors name.

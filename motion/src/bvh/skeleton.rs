@@ -20,7 +20,7 @@ const NEAR_HIPS: f64 = 0.7;
 /// A torso nearer to the waist or a shoulder than this share of an arm's length makes no bone with it.
 const BONE: f64 = 0.04;
 /// The longer of two arms is at most this many times as long as the other.
-const ARMS_ALIKE: f64 = 1.5;
+const ARMS_ALIKE: f64 = 3.0;
 
 impl Skeleton {
     pub(super) fn find(
@@ -63,12 +63,13 @@ impl Skeleton {
             _ => false,
         };
         let arms = Side::BOTH.map(|side| {
+            let by_structure = by_structure.map(|arms| arms[side as usize]);
             let found = if names_tell {
                 by_name[side as usize]
             } else {
-                by_structure.map(|arms| arms[side as usize])
+                by_structure.or(by_name[side as usize])
             };
-            map.arm(side, found)
+            map.arm(tree, side, found)
         });
         let [Some(left), Some(right)] = arms else {
             return None;
@@ -137,12 +138,17 @@ impl Map {
         self.get(BodyJoint::Node(node))
     }
 
-    fn arm(&self, side: Side, found: Option<Arm>) -> Option<Arm> {
-        let [shoulder, elbow, wrist] = side.arm().map(|node| self.node(node));
+    fn arm(&self, tree: &NamedTree, side: Side, found: Option<Arm>) -> Option<Arm> {
+        let [shoulder, mapped, wrist] = side.arm().map(|node| self.node(node));
+        let shoulder = shoulder.or(found.map(|arm| arm.shoulder))?;
+        let elbow = mapped.or(found.map(|arm| arm.elbow))?;
+        // The wrist of another elbow is none of this one's.
+        let found = found.map(|arm| arm.wrist).filter(|_| mapped.is_none());
+        let wrist = wrist.or(found).or_else(|| wrist_below(tree, elbow, side))?;
         Some(Arm {
-            shoulder: shoulder.or(found.map(|arm| arm.shoulder))?,
-            elbow: elbow.or(found.map(|arm| arm.elbow))?,
-            wrist: wrist.or(found.map(|arm| arm.wrist))?,
+            shoulder,
+            elbow,
+            wrist,
         })
     }
 
@@ -192,17 +198,21 @@ fn named_arm(tree: &NamedTree, root: usize, side: Side) -> Option<Arm> {
             let shoulder = above(Part::UpperArm)
                 .last()
                 .or_else(|| above(Part::Shoulder).next())?;
-            let wrist = tree
-                .tree
-                .descendants(elbow)
-                .find(|joint| tree.is(*joint, side, &[Part::Wrist, Part::Hand]))
-                .or_else(|| longest_child(tree.tree, elbow))?;
+            let wrist = wrist_below(tree, elbow, side)?;
             Some(Arm {
                 shoulder,
                 elbow,
                 wrist,
             })
         })
+}
+
+/// The joint called a wrist or a hand, else the end of the longest bone.
+fn wrist_below(tree: &NamedTree, elbow: usize, side: Side) -> Option<usize> {
+    let mut below = tree.tree.descendants(elbow);
+    below
+        .find(|joint| tree.is(*joint, side, &[Part::Wrist, Part::Hand]))
+        .or_else(|| longest_child(tree.tree, elbow))
 }
 
 /// The child at the end of the longest bone; the first of equal ones.

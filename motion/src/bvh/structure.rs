@@ -7,8 +7,10 @@ use super::tree::Tree;
 use crate::Side;
 use crate::names::Part;
 
-/// Limbs of a pair differ in length by at most this share.
-const ALIKE: f64 = 0.2;
+/// The bones of a pair's limbs differ by at most this share of a limb's length in all.
+const ALIKE: f64 = 0.15;
+/// A joint of a body has no more children than this.
+const MOST_CHILDREN: usize = 48;
 /// A limb has at least this share of the longest paired limb's length: fingers and ears have less.
 const LONG: f64 = 0.4;
 /// A chain beside two arms of at least this share of their length is neck and head.
@@ -146,24 +148,18 @@ impl<'a> Limbs<'a> {
         chain.take(LONGEST_CHAIN).collect()
     }
 
-    /// Like limbs at one joint: its best pair.
+    /// Like limbs at one joint: its longest pair.
     fn pair(&self, parent: usize) -> Option<Pair> {
-        let children = self.tree.children(parent);
+        self.pair_of(parent, self.tree.children(parent))
+    }
+
+    fn pair_of(&self, parent: usize, children: &[usize]) -> Option<Pair> {
         let mut best: Option<Pair> = None;
+        let children = &children[..children.len().min(MOST_CHILDREN)];
         for (i, &a) in children.iter().enumerate() {
             for &b in &children[i + 1..] {
-                let (la, lb) = (self.length(a), self.length(b));
-                let (oa, ob) = (self.tree.offsets[a].norm(), self.tree.offsets[b].norm());
-                let alike = |a: f64, b: f64| (a - b).abs() <= ALIKE * a.max(b);
-                let length = la.min(lb);
-                // Limbs that begin at one place are one limb's parts.
-                let apart = (self.tree.offsets[a] - self.tree.offsets[b]).norm() > 1e-3 * length
-                    || self.chains_part(a, b, length);
-                if alike(la, lb)
-                    && (alike(oa, ob) || oa.max(ob) < 0.1 * length)
-                    && apart
-                    && best.is_none_or(|best| length > best.length)
-                {
+                let length = self.length(a).min(self.length(b));
+                if best.is_none_or(|best| length > best.length) && self.alike(a, b) {
                     best = Some(Pair {
                         parent,
                         limbs: [a, b],
@@ -175,13 +171,17 @@ impl<'a> Limbs<'a> {
         best
     }
 
-    /// Whether the ends of two chains lie apart at rest.
-    fn chains_part(&self, a: usize, b: usize, length: f64) -> bool {
-        let end = |joint: usize| self.chain(joint).last().map(|j| self.tree.rest[*j]);
-        match (end(a), end(b)) {
-            (Some(a), Some(b)) => (a - b).norm() > 0.1 * length,
-            _ => false,
-        }
+    /// Whether two chains have like bones and end in different places.
+    fn alike(&self, a: usize, b: usize) -> bool {
+        let chains = [self.chain(a), self.chain(b)];
+        let bone = |joint: &usize| self.tree.offsets[*joint].norm();
+        let length = self.length(a).max(self.length(b));
+        let differences = chains[0].iter().zip(&chains[1]);
+        let apart: f64 = differences.map(|(a, b)| (bone(a) - bone(b)).abs()).sum();
+        let end = |chain: &Vec<usize>| self.tree.rest[*chain.last().unwrap_or(&a)];
+        chains[0].len() == chains[1].len()
+            && apart <= ALIKE * length
+            && (end(&chains[0]) - end(&chains[1])).norm() > 0.02 * length
     }
 }
 
@@ -237,20 +237,9 @@ fn two_pairs_at(limbs: &Limbs, parent: usize) -> Option<(Pair, Option<Pair>)> {
         .copied()
         .filter(|child| !first.limbs.contains(child))
         .collect();
-    let mut second: Option<Pair> = None;
-    for (i, &a) in others.iter().enumerate() {
-        for &b in &others[i + 1..] {
-            let (la, lb) = (limbs.length(a), limbs.length(b));
-            if (la - lb).abs() <= ALIKE * la.max(lb) && la.min(lb) >= LONG * first.length {
-                second = Some(Pair {
-                    parent,
-                    limbs: [a, b],
-                    length: la.min(lb),
-                });
-            }
-        }
-    }
-    let second = second?;
+    let second = limbs
+        .pair_of(parent, &others)
+        .filter(|second| second.length >= LONG * first.length)?;
     let head = others
         .into_iter()
         .find(|child| !second.limbs.contains(child));

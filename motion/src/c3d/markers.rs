@@ -14,6 +14,8 @@ const SHOULDER_DEPTH: f64 = 0.17;
 const ELBOW_DEPTH: f64 = 0.16;
 /// Sine of the elbow's angle above which forearm and upper arm tell the elbow's axis.
 const BENT: f64 = 0.25;
+/// Steps in which an elbow's place and axis are found together.
+const SKIN_STEPS: usize = 4;
 /// A marker that is seen in a smaller share of the frames is none.
 const SEEN: f64 = 0.5;
 
@@ -502,20 +504,7 @@ impl ArmMarkers {
             shoulder -= trunk * (SHOULDER_DEPTH * upper.norm());
         }
         if matches!(self.elbow, Place::Under(_)) {
-            let (upper, fore) = (elbow - shoulder, wrist - elbow);
-            let cross = upper.cross(&fore);
-            let inward = if side == Side::Left { 1.0 } else { -1.0 };
-            let bent = cross.norm() > BENT * upper.norm() * fore.norm();
-            let told = if bent { Some(cross * inward) } else { *axis };
-            // The axis stays at right angles to the upper arm.
-            let across = told.and_then(|axis| {
-                let along = upper.try_normalize(1e-9)?;
-                (axis - along * along.dot(&axis)).try_normalize(1e-9)
-            });
-            if let Some(across) = across {
-                elbow += across * (ELBOW_DEPTH * fore.norm());
-                *axis = Some(across);
-            }
+            elbow = under_skin(shoulder, elbow, wrist, side, axis);
         }
         [shoulder, elbow, wrist]
     }
@@ -530,6 +519,34 @@ impl ArmMarkers {
         let fingers = self.hand.map_or(wrist - elbow, |hand| at(hand) - wrist);
         frame_of(fingers, at(thumb) - at(little))
     }
+}
+
+/// The elbow's joint inside of its outer marker, along the axis about which the elbow bends. Where the arm is straight,
+/// `axis` is that of the frame before.
+fn under_skin(
+    shoulder: Vector3<f64>,
+    skin: Vector3<f64>,
+    wrist: Vector3<f64>,
+    side: Side,
+    axis: &mut Option<Vector3<f64>>,
+) -> Vector3<f64> {
+    let inward = if side == Side::Left { 1.0 } else { -1.0 };
+    let mut elbow = skin;
+    // The axis is at right angles to bones that end at the joint, not at the skin.
+    for _ in 0..SKIN_STEPS {
+        let (upper, fore) = (elbow - shoulder, wrist - elbow);
+        let cross = upper.cross(&fore);
+        let bent = cross.norm() > BENT * upper.norm() * fore.norm();
+        let told = if bent { Some(cross * inward) } else { *axis };
+        let across = told.and_then(|axis| {
+            let along = upper.try_normalize(1e-9)?;
+            (axis - along * along.dot(&axis)).try_normalize(1e-9)
+        });
+        let Some(across) = across else { break };
+        elbow = skin + across * (ELBOW_DEPTH * fore.norm());
+        *axis = Some(across);
+    }
+    elbow
 }
 
 /// The usual spelling of a marker, for messages.

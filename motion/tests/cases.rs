@@ -853,3 +853,102 @@ fn a_second_person_is_left_out_whatever_its_names() {
         .collect();
     assert_same(&parse(&first).expect("valid").clip, &good(), "a prop first");
 }
+
+/// The plain skeleton with hanging arms at rest and hands that end at the wrist, as in many games; `set` fills a frame's values.
+fn game_skeleton(frames: usize, set: impl Fn(usize, &mut [f64])) -> String {
+    let text = text("00_good.bvh");
+    let head = &text[..text.find("Frames:").expect("motion")];
+    let head = ["28.0000", "25.0000"]
+        .iter()
+        .fold(head.to_owned(), |head, length| {
+            [length.to_string(), format!("-{length}")]
+                .iter()
+                .fold(head, |head, along| {
+                    head.replace(
+                        &format!("OFFSET {along} 0.0000 0.0000"),
+                        &format!("OFFSET 0.0000 -{length} 0.0000"),
+                    )
+                })
+        });
+    let head = head
+        .replace("OFFSET 9.0000 0.0000 0.0000", "OFFSET 0 0 0")
+        .replace("OFFSET -9.0000 0.0000 0.0000", "OFFSET 0 0 0");
+    let width = text
+        .lines()
+        .last()
+        .expect("values")
+        .split_ascii_whitespace()
+        .count();
+    let lines = (0..frames).map(|frame| {
+        let mut values = vec![0.0; width];
+        values[1] = 95.0;
+        set(frame, &mut values);
+        values
+            .iter()
+            .map(f64::to_string)
+            .collect::<Vec<_>>()
+            .join(" ")
+            + "\n"
+    });
+    format!(
+        "{head}Frames: {frames}\nFrame Time: 0.05\n{}",
+        lines.collect::<String>()
+    )
+}
+
+const LEFT_ARM_Z: usize = 21;
+const LEFT_FOREARM_X: usize = 26;
+const LEFT_HAND_Y: usize = 28;
+
+#[test]
+fn hands_of_a_skeleton_without_fingers_are_told_by_the_calmest_frames() {
+    // The arm hangs for a while, then the forearm is raised and the hand turned about it.
+    let text = game_skeleton(60, |frame, values| {
+        let raised = (frame as f64 - 30.0).max(0.0) * 2.0;
+        values[LEFT_FOREARM_X] = -raised;
+        values[LEFT_HAND_Y] = raised;
+    });
+    let reading = parse(&text).expect("valid");
+    assert!(
+        reading.understanding.hands[0].contains("calmest"),
+        "{:?}",
+        reading.understanding.hands
+    );
+    let close = |a: Vector3<f32>, b: Vector3<f32>| assert!((a - b).norm() < 0.02, "{a} is not {b}");
+    let hand = |frame: usize| reading.clip.frames[frame].wrist_rotations[0].expect("followed");
+    close(hand(0) * Vector3::x(), -Vector3::z());
+    close(hand(0) * Vector3::z(), Vector3::x());
+    // 58° up, and 58° about the forearm, which points forward and down: the thumb turns outward from up and forward.
+    let last = reading.clip.frames.last().expect("frames");
+    close(hand(59) * Vector3::x(), last.forearm(Side::Left));
+    let turned = (hand(59) * Vector3::z()).y.asin();
+    assert!(
+        (turned.abs() - 58_f32.to_radians()).abs() < 0.05,
+        "{turned}"
+    );
+}
+
+#[test]
+fn hands_that_nothing_tells_are_said_not_to_be_followed() {
+    // Arms straight up throughout.
+    let text = game_skeleton(20, |frame, values| {
+        values[LEFT_ARM_Z] = 175.0 + frame as f64 * 0.1;
+        values[LEFT_ARM_Z + 12] = -175.0;
+    });
+    let reading = parse(&text).expect("valid");
+    for side in 0..2 {
+        assert!(
+            reading.understanding.hands[side].starts_with("not followed: "),
+            "{:?}",
+            reading.understanding.hands
+        );
+        assert!(
+            reading
+                .clip
+                .frames
+                .iter()
+                .all(|f| f.wrist_rotations[side].is_none())
+        );
+    }
+    assert!(reading.understanding.summary().contains("not followed"));
+}

@@ -4,7 +4,7 @@
 //! compiled MuJoCo model and [`Kinematics`]: batched forward kinematics with an analytic reverse pass.
 //! Joint counts, names, orders, gains and scales come from those files, never from code.
 //!
-//! This crate never simulates, never learns, and knows nothing of human motion, networks or the wire.
+//! This library never simulates, never learns, and knows nothing of human motion, networks or the wire.
 //!
 //! Frames: x forward, y left, z up. Units: metres, radians, seconds, kilograms, newton metres.
 

@@ -77,7 +77,7 @@ impl JointMirror {
 
 impl Robot {
     /// The robot's mirror image, read off the model: a joint's partner is the one whose name has `left` for `right`
-    /// or the other way round (a joint without either is its own), and the sign follows from the two axes.
+    /// or the other way round, in any case of letters (a joint without either is its own), and the sign follows from the two axes.
     ///
     /// # Errors
     /// If a joint has no partner, or partners differ in place, axis, limits or default angle by more than a
@@ -162,13 +162,17 @@ impl Hinges {
     }
 }
 
-/// The joint's name on the other side.
+/// The joint's name on the other side: the first of these words that it has is exchanged.
 fn partner(name: &str) -> String {
-    if name.contains("left") {
-        name.replace("left", "right")
-    } else {
-        name.replace("right", "left")
-    }
+    const SIDES: [[&str; 2]; 3] = [["left", "right"], ["Left", "Right"], ["LEFT", "RIGHT"]];
+    let exchanged = SIDES.into_iter().find_map(|[left, right]| {
+        if name.contains(left) {
+            Some(name.replace(left, right))
+        } else {
+            name.contains(right).then(|| name.replace(right, left))
+        }
+    });
+    exchanged.unwrap_or_else(|| name.to_owned())
 }
 
 fn differ(a: [f64; 3], b: [f64; 3]) -> bool {

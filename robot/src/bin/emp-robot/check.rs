@@ -3,7 +3,6 @@
 use std::fmt;
 
 use emp_robot::{KEY_NODE_NAMES, Robot};
-use mujoco_rs::prelude::*;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector2, Vector3};
 
 /// How long the default pose is held, seconds.

@@ -1,7 +1,5 @@
 //! A picture of a robot without a graphics card: a ray a pixel through MuJoCo's model, from two sides.
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::Result;
@@ -33,17 +31,18 @@ pub(crate) struct Image {
 impl Image {
     /// Writes a PNG under a temporary name and renames it.
     pub(crate) fn write(&self, path: &Path) -> Result<()> {
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty());
-        let file = tempfile::NamedTempFile::new_in(folder.unwrap_or(Path::new(".")))?;
         let height = self.pixels.len() / (3 * self.width);
+        let mut bytes = Vec::new();
         let mut encoder = png::Encoder::new(
-            BufWriter::new(File::create(file.path())?),
+            &mut bytes,
             u32::try_from(self.width)?,
             u32::try_from(height)?,
         );
         encoder.set_color(png::ColorType::Rgb);
         encoder.write_header()?.write_image_data(&self.pixels)?;
-        file.persist(path)?;
+        let partial = path.with_extension("partial");
+        std::fs::write(&partial, bytes)?;
+        std::fs::rename(&partial, path)?;
         Ok(())
     }
 
@@ -109,7 +108,7 @@ fn key_nodes(robot: &Robot) -> Vec<(Vector3<f64>, [u8; 3])> {
 }
 
 /// The highest middle of a geom: about the robot's height.
-fn height<M: std::ops::Deref<Target = MjModel>>(data: &MjData<M>) -> f64 {
+fn height(data: &MjData<&MjModel>) -> f64 {
     data.geom_xpos().iter().map(|p| p[2]).fold(0.3, f64::max)
 }
 
@@ -161,9 +160,9 @@ impl Camera {
 }
 
 /// The colour that a pixel's ray meets.
-fn shade<M: std::ops::Deref<Target = MjModel>>(
+fn shade(
     model: &MjModel,
-    data: &mut MjData<M>,
+    data: &mut MjData<&MjModel>,
     camera: &Camera,
     x: usize,
     y: usize,
@@ -183,7 +182,10 @@ fn shade<M: std::ops::Deref<Target = MjModel>>(
     let Some(geom) = geom else {
         return [24, 26, 30];
     };
-    let [r, g, b, _] = model.geom_rgba()[geom];
+    let material = usize::try_from(model.geom_matid()[geom]).ok();
+    let [r, g, b, _] = material.map_or(model.geom_rgba()[geom], |material| {
+        model.mat_rgba()[material]
+    });
     let light = Vector3::from(LIGHT).normalize();
     let normal = Vector3::from(normal);
     let facing = if normal.dot(&ray) > 0.0 {

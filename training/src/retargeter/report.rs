@@ -214,8 +214,9 @@ pub fn load_sets(folders: &[PathBuf], rate: f64) -> Result<Vec<Set>> {
                 });
             }
             let Some(set) = sets.last_mut() else { continue };
-            match emp_motion::load(&path) {
-                Ok(clip) => set.clips.push(clip.resampled(rate)),
+            match emp_motion::load(&path).map(|clip| clip.resampled(rate)) {
+                Ok(Ok(clip)) => set.clips.push(clip),
+                Ok(Err(error)) => set.skipped.push(format!("{}: {error}", path.display())),
                 Err(error) => set.skipped.push(error.to_string()),
             }
         }
@@ -264,7 +265,10 @@ pub fn held_out(retargeter: &Retargeter) -> Result<Set> {
     let library = emp_motion::skills::library(SEED, CLIPS);
     Ok(Set {
         name: format!("procedural, seed {SEED}"),
-        clips: library.iter().map(|clip| clip.resampled(rate)).collect(),
+        clips: library
+            .iter()
+            .map(|clip| clip.resampled(rate))
+            .collect::<Result<_, _>>()?,
         skipped: Vec::new(),
     })
 }

@@ -33,6 +33,24 @@ pub(crate) struct Arguments {
         env = "EMP_SERVER_URL"
     )]
     pub(crate) server: String,
+    /// PEM file with the authority of the server's certificate [default: the system's]
+    #[arg(long, global = true, value_name = "FILE", env = "EMP_CA")]
+    pub(crate) ca: Option<PathBuf>,
+    /// PEM file with a certificate of this client
+    #[arg(long, global = true, value_name = "FILE", requires = "key")]
+    pub(crate) cert: Option<PathBuf>,
+    /// PEM file with the certificate's private key
+    #[arg(long, global = true, value_name = "FILE", requires = "cert")]
+    pub(crate) key: Option<PathBuf>,
+    /// Token of this client; better in the environment than on a command line, which others see
+    #[arg(
+        long,
+        global = true,
+        value_name = "TOKEN",
+        env = "EMP_TOKEN",
+        hide_env_values = true
+    )]
+    pub(crate) token: Option<String>,
     /// Print JSON on standard output instead of text
     #[arg(long, global = true)]
     pub(crate) json: bool,

@@ -1,6 +1,6 @@
 //! A connection and its single calls.
 
-use std::time::{Duration, Instant};
+use std::{fmt, time::Instant};
 
 use emp_motion::{Clip, KeyNodeFrame};
 use emp_proto::v1::{
@@ -8,13 +8,17 @@ use emp_proto::v1::{
     GoalClip, ListModelsRequest, Model, RetargetRequest, Robot, TeleoperationRole,
     model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
 };
-use tonic::transport::{Channel, Endpoint};
+use tonic::metadata::MetadataMap;
 
 use crate::{
-    Answer, Backoff, ClientError, Collection, Evaluation, FilterAnswer, FilterConfig, FrameSender,
-    GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, PoseSender, RobotFrame, SessionEvents,
-    StreamConfig, StreamEvents, TeleoperationAnswer, TeleoperationConfig, TeleoperationFrame,
-    driver, listener, teleoperation::RobotEnd, wire,
+    Answer, Backoff, ClientError, Collection, ConnectOptions, Evaluation, FilterAnswer,
+    FilterConfig, FrameSender, GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, PoseSender,
+    RobotFrame, SessionEvents, StreamConfig, StreamEvents, TeleoperationAnswer,
+    TeleoperationConfig, TeleoperationFrame, driver,
+    endpoint::{self, Channel, Metadata},
+    listener,
+    teleoperation::RobotEnd,
+    wire,
 };
 
 /// Both ends of a stream with a robot at its end.
@@ -23,16 +27,20 @@ type TeleoperationStream = (
     StreamEvents<TeleoperationAnswer>,
 );
 
-/// How long a connection may take to stand.
-const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// A silent connection is asked after this long, and given up when it does not answer in time.
-const KEEPALIVE: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(5)];
-
 /// A client of one server. Cheap to clone; clones share the connection, which comes back by itself.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Client {
-    channel: Channel,
+    channel: tonic::transport::Channel,
+    metadata: Metadata,
     backoff: Backoff,
+}
+
+impl fmt::Debug for Client {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Client")
+            .field("backoff", &self.backoff)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Client {
@@ -41,22 +49,39 @@ impl Client {
     /// # Errors
     /// When the URL is none or nothing answers there.
     pub async fn connect(url: &str) -> Result<Self, ClientError> {
-        let failed = |error: tonic::transport::Error| ClientError::Connect {
-            url: url.to_owned(),
-            reason: root_cause(&error),
-        };
-        let endpoint = Endpoint::from_shared(url.to_owned())
-            .map_err(failed)?
-            .connect_timeout(CONNECT_TIMEOUT)
-            .tcp_nodelay(true)
-            .http2_keep_alive_interval(KEEPALIVE[0])
-            .keep_alive_timeout(KEEPALIVE[1])
-            .keep_alive_while_idle(true);
-        let channel = endpoint.connect().await.map_err(failed)?;
+        Self::connect_with(url, ConnectOptions::default()).await
+    }
+
+    /// Connects to a server with credentials, or one whose certificate an authority of its own signed.
+    ///
+    /// # Errors
+    /// When the URL is none, nothing answers there, the certificates do not fit, or a token would go over a network in the
+    /// clear.
+    pub async fn connect_with(url: &str, options: ConnectOptions) -> Result<Self, ClientError> {
+        let (channel, metadata) = endpoint::connect(url, options).await?;
         Ok(Self {
             channel,
+            metadata,
             backoff: Backoff::default(),
         })
+    }
+
+    /// A client over a channel that the program made itself, for example through a proxy.
+    pub fn from_channel(channel: tonic::transport::Channel) -> Self {
+        Self {
+            channel,
+            metadata: Metadata::default(),
+            backoff: Backoff::default(),
+        }
+    }
+
+    /// The same client, whose every call passes its metadata to `hook`, which may add to it: a token that changes, a trace.
+    #[must_use]
+    pub fn with_metadata(self, hook: impl Fn(&mut MetadataMap) + Send + Sync + 'static) -> Self {
+        Self {
+            metadata: self.metadata.with_hook(hook),
+            ..self
+        }
     }
 
     /// The same client with other pauses between attempts to restore a stream's connection.
@@ -259,7 +284,7 @@ impl Client {
         config: EvaluateConfig,
         motions: Vec<Clip>,
     ) -> Result<Evaluation, ClientError> {
-        Evaluation::start(self.channel.clone(), config, motions).await
+        Evaluation::start(self.channel(), config, motions).await
     }
 
     /// Places simulated robots on the server, for a learner. The config's number of clips is set to that of `library`.
@@ -271,23 +296,18 @@ impl Client {
         config: CollectRolloutsConfig,
         library: Vec<GoalClip>,
     ) -> Result<Collection, ClientError> {
-        Collection::start(self.channel.clone(), config, library).await
+        Collection::start(self.channel(), config, library).await
+    }
+
+    fn channel(&self) -> Channel {
+        Channel::new(self.channel.clone(), self.metadata.clone())
     }
 
     fn motion_service(&self) -> MotionServiceClient<Channel> {
-        MotionServiceClient::new(self.channel.clone())
+        MotionServiceClient::new(self.channel())
     }
 
     fn model_service(&self) -> ModelServiceClient<Channel> {
-        ModelServiceClient::new(self.channel.clone())
+        ModelServiceClient::new(self.channel())
     }
-}
-
-/// The last link of an error's chain, which is the system's own word.
-fn root_cause(error: &dyn std::error::Error) -> String {
-    let mut cause = error;
-    while let Some(source) = cause.source() {
-        cause = source;
-    }
-    cause.to_string()
 }

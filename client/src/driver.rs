@@ -4,12 +4,13 @@ use std::{collections::VecDeque, time::Instant};
 
 use emp_proto::v1::{Delivery, motion_service_client::MotionServiceClient};
 use tokio::{sync::mpsc, time::sleep_until};
-use tonic::{Status, transport::Channel};
+use tonic::Status;
 
 use crate::{
     Backoff, ClientError, DropCause, Dropped, Event, FrameSender, StreamEvents,
     backoff::Break,
     connection::{self, Attempts, EVENTS, End, HAND_OVER},
+    endpoint::Channel,
     kind::{Incoming, Kind, Started},
     stream::Outbound,
     wire,

@@ -12,11 +12,11 @@ use emp_proto::v1::{
     stream_retarget_request, stream_retarget_response,
 };
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming, transport::Channel};
+use tonic::{Status, Streaming};
 
 use crate::{
     Answer, AnswerTimes, FilterAnswer, FilterConfig, GoalFrame, PolicyAnswer, PolicyConfig,
-    RobotFrame, StreamConfig, wire,
+    RobotFrame, StreamConfig, endpoint::Channel, wire,
 };
 
 /// A stream's config, which says of what kind the stream is.

@@ -33,6 +33,7 @@ mod backoff;
 mod client;
 mod connection;
 mod driver;
+mod endpoint;
 mod error;
 mod kind;
 mod listener;
@@ -53,6 +54,7 @@ pub use emp_proto::v1::{
     RolloutBlock, Spread, StepEnd, TeleoperatedFrame, TeleoperationPresence, TeleoperationStarted,
     Timing, TrainingEnd, evaluate_response::Message as EvaluationEvent,
 };
+pub use endpoint::ConnectOptions;
 pub use error::ClientError;
 pub use rollouts::{Collection, Evaluation};
 pub use statistics::{

@@ -8,12 +8,13 @@ use emp_proto::v1::{
     motion_service_client::MotionServiceClient, teleoperate_response::Message,
 };
 use tokio::{sync::mpsc, time::sleep_until};
-use tonic::{Status, transport::Channel};
+use tonic::Status;
 
 use crate::{
     Backoff, ClientError, PoseSender, SessionEvent, SessionEvents, TeleoperationConfig,
     backoff::Break,
     connection::{self, Attempts, EVENTS, End, HAND_OVER},
+    endpoint::Channel,
     teleoperation, wire,
 };
 

@@ -11,9 +11,11 @@ mod report;
 mod retarget;
 mod session;
 
-use std::process::ExitCode;
+use std::{path::Path, process::ExitCode};
 
+use anyhow::Context as _;
 use clap::Parser as _;
+use emp_client::ConnectOptions;
 
 use crate::cli::{Arguments, Command};
 
@@ -41,9 +43,27 @@ fn failure(error: &anyhow::Error) -> ExitCode {
     ExitCode::FAILURE
 }
 
+fn connect_options(arguments: &Arguments) -> anyhow::Result<ConnectOptions> {
+    let read = |path: &Path| std::fs::read(path).with_context(|| path.display().to_string());
+    let mut options = ConnectOptions::default();
+    if let Some(ca) = &arguments.ca {
+        options = options.with_ca(read(ca)?);
+    }
+    if let (Some(certificate), Some(key)) = (&arguments.cert, &arguments.key) {
+        options = options.with_certificate(read(certificate)?, read(key)?);
+    }
+    if let Some(token) = &arguments.token {
+        options = options.with_token(token);
+    }
+    Ok(options)
+}
+
 async fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let json = arguments.json;
-    let connect = || emp_client::Client::connect(&arguments.server);
+    let connect = async || {
+        let options = connect_options(&arguments)?;
+        anyhow::Ok(emp_client::Client::connect_with(&arguments.server, options).await?)
+    };
     match &arguments.command {
         Command::Inspect(command) => inspect::run(command, json),
         Command::Retarget(command) => retarget::run(&connect().await?, command, json).await,

@@ -10,8 +10,9 @@ use emp_proto::v1::{
 };
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Streaming, transport::Channel};
+use tonic::Streaming;
 
+use crate::endpoint::Channel;
 use crate::{ClientError, wire};
 
 /// Largest message of a job.

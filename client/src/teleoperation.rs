@@ -12,10 +12,11 @@ use emp_proto::v1::{
 use nalgebra::UnitQuaternion;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming, transport::Channel};
+use tonic::{Status, Streaming};
 
 use crate::{
     AnswerTimes, ClientError, Dropped, StreamClosed,
+    endpoint::Channel,
     kind::{Incoming, Kind, Started},
     wire,
 };

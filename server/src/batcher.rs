@@ -14,6 +14,7 @@ use tokio::sync::{oneshot, watch};
 
 use crate::{
     backend::{Backend, BackendError},
+    metrics::{ModelMetrics, metrics},
     queue::{Answer, Job, JobError, Key, Outcome, Priority, Queue},
 };
 
@@ -102,6 +103,7 @@ impl<I: Send + 'static, O: Send + 'static> Batcher<I, O> {
         let (built_sender, built) = std::sync::mpsc::sync_channel(1);
         let worker = Worker {
             name: name.to_owned(),
+            metrics: metrics().model(name),
             shared: Arc::clone(&shared),
             state: state_sender,
         };
@@ -139,8 +141,8 @@ impl<I: Send + 'static, O: Send + 'static> Batcher<I, O> {
         if inner.state == ModelState::Rebuilding {
             return Err(Rejected::Unavailable);
         }
-        let (job, outcome) = Job::new(input, deadline);
-        match inner.queue.push(priority, job) {
+        let (job, outcome) = Job::new(priority, input, deadline);
+        match inner.queue.push(job) {
             Ok(key) => {
                 self.shared.changed.notify_one();
                 Ok(Ticket { key, outcome })
@@ -218,6 +220,7 @@ impl<I, O> Shared<I, O> {
 /// The model's thread.
 struct Worker<I, O> {
     name: String,
+    metrics: ModelMetrics,
     shared: Arc<Shared<I, O>>,
     state: watch::Sender<ModelState>,
 }
@@ -254,6 +257,10 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
                 return None;
             }
             let batch = inner.queue.take_batch(self.shared.limits.max_batch);
+            for priority in [Priority::Stream, Priority::Unary] {
+                self.metrics
+                    .waiting(priority, inner.queue.waiting(priority));
+            }
             if !batch.is_empty() {
                 return Some(batch);
             }
@@ -273,10 +280,11 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
         let start = Instant::now();
         let (inputs, waiting): (Vec<_>, Vec<_>) = batch
             .into_iter()
-            .map(|job| (job.input, (start - job.arrived, job.reply)))
+            .map(|job| (job.input, (start - job.arrived, job.priority, job.reply)))
             .unzip();
         let outcome = guarded(|| backend.run(&inputs));
         let inference_time = start.elapsed();
+        self.metrics.batch(inputs.len(), inference_time);
         let (outputs, panic) = match outcome {
             Ok(Ok(outputs)) if outputs.len() == inputs.len() => (Ok(outputs), None),
             Ok(Ok(outputs)) => {
@@ -293,7 +301,9 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
         match outputs {
             Ok(outputs) => {
                 let batch_size = inputs.len();
-                for (output, (queue_time, reply)) in outputs.into_iter().zip(waiting) {
+                for (output, (queue_time, priority, reply)) in outputs.into_iter().zip(waiting) {
+                    self.metrics
+                        .answered(priority, queue_time, queue_time + inference_time);
                     let _ = reply.send(Ok(Answer {
                         output,
                         queue_time,
@@ -310,7 +320,7 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
                     explanation,
                     "a batch failed"
                 );
-                for (_, reply) in waiting {
+                for (_, _, reply) in waiting {
                     let _ = reply.send(Err(JobError::ModelFailed(explanation.clone())));
                 }
             }
@@ -349,6 +359,7 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
     fn set_state(&self, state: ModelState) {
         self.shared.lock().state = state;
         self.state.send_replace(state);
+        self.metrics.serving(state == ModelState::Serving);
     }
 }
 

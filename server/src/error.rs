@@ -85,11 +85,29 @@ pub(crate) enum ServiceError {
     /// A session has one robot and one operator at most.
     #[error("session {session:?} has its {seat} already")]
     SeatTaken { session: String, seat: &'static str },
+    /// The reason is one of the `CREDENTIALS_` reasons.
+    #[error("{}", credentials(.0))]
+    Unauthenticated(&'static str),
+    #[error("{name:?} may not {what}")]
+    PermissionDenied { name: String, what: String },
+    #[error("there is no such method")]
+    UnknownMethod,
     #[error("the server is shutting down")]
     ShuttingDown,
     /// The transport ended the call (reset by the client, message too large, not decodable): its status stands.
     #[error("{}", .0.message())]
     Transport(Status),
+}
+
+fn credentials(reason: &str) -> &'static str {
+    match reason {
+        "CREDENTIALS_MISSING" => {
+            "this server asks for credentials: metadata `authorization: Bearer TOKEN`, or a client certificate"
+        }
+        "CREDENTIALS_EXPIRED" => "the credentials have expired",
+        "CREDENTIALS_REVOKED" => "the credentials were revoked or changed",
+        _ => "the credentials are not known",
+    }
 }
 
 impl From<JobError> for ServiceError {
@@ -121,6 +139,9 @@ impl ServiceError {
             Self::NotFound { .. } => Code::NotFound,
             Self::DeadlineExceeded => Code::DeadlineExceeded,
             Self::SeatTaken { .. } => Code::AlreadyExists,
+            Self::Unauthenticated(_) => Code::Unauthenticated,
+            Self::PermissionDenied { .. } => Code::PermissionDenied,
+            Self::UnknownMethod => Code::Unimplemented,
             Self::Overloaded { .. } => Code::ResourceExhausted,
             Self::ModelFailed(_) | Self::JobFailed(_) => Code::Internal,
             Self::ModelUnavailable | Self::ShuttingDown => Code::Unavailable,
@@ -129,7 +150,7 @@ impl ServiceError {
     }
 
     /// The `reason` of the `ErrorInfo`; stable, for programs to match on.
-    fn reason(&self) -> &'static str {
+    pub(crate) fn reason(&self) -> &'static str {
         match self {
             Self::InvalidField(_) => "INVALID_FIELD",
             Self::NotServed { .. } => "NOT_SERVED",
@@ -139,6 +160,9 @@ impl ServiceError {
             Self::ModelFailed(_) => "MODEL_FAILED",
             Self::JobFailed(_) => "JOB_FAILED",
             Self::SeatTaken { .. } => "SEAT_TAKEN",
+            Self::Unauthenticated(reason) => reason,
+            Self::PermissionDenied { .. } => "PERMISSION_DENIED",
+            Self::UnknownMethod => "UNKNOWN_METHOD",
             Self::ModelUnavailable => "MODEL_UNAVAILABLE",
             Self::ShuttingDown => "SHUTTING_DOWN",
             Self::Transport(_) => "TRANSPORT",

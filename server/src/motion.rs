@@ -27,6 +27,7 @@ use crate::{
     control::{EmpMode, FilterOutput, PolicyOutput},
     deadline,
     error::{FieldError, ServiceError},
+    identity::{Caller, Role},
     pose,
     queue::{Answer, Priority},
     robot_state::{self, Past},
@@ -75,6 +76,7 @@ impl Motion {
         request: Request<RetargetRequest>,
     ) -> Result<RetargetResponse, ServiceError> {
         let due = Due::of_call(request.metadata())?;
+        let caller = Caller::of(request.extensions());
         let RetargetRequest {
             header,
             robot,
@@ -87,6 +89,8 @@ impl Motion {
         let model = self
             .catalog
             .retargeter_for(&robot, &model, &model_version)?;
+        // Its method needs one of two roles; this asks about the robot.
+        caller.may(Role::Observer, &robot, "")?;
         let frame = pose::read(pose.as_ref())?;
         let input = RetargetInput {
             frame,
@@ -111,6 +115,7 @@ impl Motion {
         request: Request<StepPolicyRequest>,
     ) -> Result<StepPolicyResponse, ServiceError> {
         let due = Due::of_call(request.metadata())?;
+        let caller = Caller::of(request.extensions());
         let StepPolicyRequest {
             header,
             robot,
@@ -122,6 +127,7 @@ impl Motion {
             last_applied,
         } = request.into_inner();
         let model = self.catalog.policy_for(&robot, &model, &model_version)?;
+        caller.may(Role::Robot, &robot, "")?;
         let has_emp = model.model.emp().is_some();
         let mode = robot_state::read_mode("emp_mode", emp_mode, EmpMode::Off, has_emp)?;
         let past = Past {
@@ -147,6 +153,7 @@ impl Motion {
         request: Request<FilterGoalRequest>,
     ) -> Result<FilterGoalResponse, ServiceError> {
         let due = Due::of_call(request.metadata())?;
+        let caller = Caller::of(request.extensions());
         let FilterGoalRequest {
             header,
             robot,
@@ -158,6 +165,7 @@ impl Motion {
             last_applied,
         } = request.into_inner();
         let model = self.catalog.filter_for(&robot, &model, &model_version)?;
+        caller.may(Role::Robot, &robot, "")?;
         let mode = robot_state::read_mode("emp_mode", emp_mode, EmpMode::On, true)?;
         let past = Past {
             history: &history,
@@ -211,6 +219,7 @@ impl Motion {
             buffer: self.buffer,
             drain: self.drain.clone(),
             deadline,
+            caller: Caller::of(request.extensions()),
         };
         tokio::spawn(serve(context, request.into_inner(), sender).in_current_span());
         Ok(SessionStream {

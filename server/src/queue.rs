@@ -61,6 +61,7 @@ pub(crate) type Outcome<O> = Result<Answer<O>, JobError>;
 
 pub(crate) struct Job<I, O> {
     pub(crate) input: I,
+    pub(crate) priority: Priority,
     pub(crate) arrived: Instant,
     deadline: Option<Instant>,
     pub(crate) reply: oneshot::Sender<Outcome<O>>,
@@ -68,6 +69,7 @@ pub(crate) struct Job<I, O> {
 
 impl<I, O> Job<I, O> {
     pub(crate) fn new(
+        priority: Priority,
         input: I,
         deadline: Option<Instant>,
     ) -> (Self, oneshot::Receiver<Outcome<O>>) {
@@ -75,6 +77,7 @@ impl<I, O> Job<I, O> {
         (
             Self {
                 input,
+                priority,
                 arrived: Instant::now(),
                 deadline,
                 reply,
@@ -121,16 +124,21 @@ impl<I, O> Queue<I, O> {
         self.jobs.is_empty()
     }
 
-    pub(crate) fn is_full(&self, priority: Priority) -> bool {
+    /// How many jobs of a priority wait.
+    pub(crate) fn waiting(&self, priority: Priority) -> usize {
         self.jobs
             .keys()
             .filter(|key| key.priority == priority)
             .count()
-            >= self.limit
+    }
+
+    pub(crate) fn is_full(&self, priority: Priority) -> bool {
+        self.waiting(priority) >= self.limit
     }
 
     /// Adds a job, or gives it back when there is no room. Cancelled and late jobs make room first.
-    pub(crate) fn push(&mut self, priority: Priority, job: Job<I, O>) -> Result<Key, Job<I, O>> {
+    pub(crate) fn push(&mut self, job: Job<I, O>) -> Result<Key, Job<I, O>> {
+        let priority = job.priority;
         if self.is_full(priority) {
             self.discard_dead(Instant::now());
             if self.is_full(priority) {
@@ -213,11 +221,8 @@ mod tests {
         due_in_ms: Option<u64>,
     ) -> (Key, oneshot::Receiver<Outcome<u32>>) {
         let deadline = due_in_ms.map(|ms| Instant::now() + Duration::from_millis(ms));
-        let (job, outcome) = Job::new(input, deadline);
-        (
-            queue.push(priority, job).map_err(|_| "full").expect("room"),
-            outcome,
-        )
+        let (job, outcome) = Job::new(priority, input, deadline);
+        (queue.push(job).map_err(|_| "full").expect("room"), outcome)
     }
 
     fn inputs(batch: &[Job<u32, u32>]) -> Vec<u32> {
@@ -243,8 +248,8 @@ mod tests {
         let mut queue = TestQueue::new(1);
         let (_, unary) = push(&mut queue, Priority::Unary, 1, None);
         let _stream = push(&mut queue, Priority::Stream, 2, None);
-        let (refused, _outcome) = Job::new(3, None);
-        assert!(queue.push(Priority::Unary, refused).is_err());
+        let (refused, _outcome) = Job::new(Priority::Unary, 3, None);
+        assert!(queue.push(refused).is_err());
         drop(unary);
         let _unary = push(&mut queue, Priority::Unary, 4, None);
         assert_eq!(inputs(&queue.take_batch(8)), [2, 4]);

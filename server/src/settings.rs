@@ -2,7 +2,7 @@
 
 use std::{
     net::SocketAddr,
-    num::NonZeroUsize,
+    num::{NonZeroU32, NonZeroUsize},
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -30,6 +30,14 @@ pub struct Settings {
     pub weights: Option<PathBuf>,
     /// Logging.
     pub log: LogSettings,
+    /// Connections.
+    pub connections: ConnectionSettings,
+    /// TLS.
+    pub tls: TlsSettings,
+    /// Who may use the server.
+    pub access: AccessSettings,
+    /// Browsers and monitoring.
+    pub http: HttpSettings,
     /// How frames meet models.
     pub batching: BatchingSettings,
     /// Open streams.
@@ -50,6 +58,89 @@ pub struct LogSettings {
     pub format: LogFormat,
     /// Filter, in tracing's form.
     pub filter: String,
+    /// Most lines a second, of warnings and errors and of all others; five seconds' worth may come at once.
+    pub lines_per_second: NonZeroU32,
+}
+
+/// Connections.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConnectionSettings {
+    /// Most open connections.
+    pub max: NonZeroUsize,
+    /// Most open connections from one address.
+    pub max_per_address: NonZeroUsize,
+    /// Most calls that are open on one connection.
+    pub max_streams: NonZeroU32,
+    /// How long a connection may take until it begins to speak, TLS included, seconds.
+    pub handshake_seconds: f64,
+}
+
+/// TLS. Without a certificate the server speaks in the clear.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TlsSettings {
+    /// PEM file with the server's certificate and those that lead to its authority.
+    pub certificate: Option<PathBuf>,
+    /// PEM file with the certificate's private key.
+    pub key: Option<PathBuf>,
+    /// PEM file with the authorities of client certificates.
+    pub client_ca: Option<PathBuf>,
+    /// Whether a client must have a certificate.
+    pub client_certificates: ClientCertificates,
+}
+
+/// Whether a client must have a certificate, where there are authorities for them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ClientCertificates {
+    /// A token does, too.
+    Optional,
+    /// A connection without one is refused.
+    Required,
+}
+
+impl TlsSettings {
+    fn check(&self) -> Result<(), SettingsError> {
+        let pairs = [
+            ("tls.certificate", &self.certificate, "tls.key", &self.key),
+            ("tls.key", &self.key, "tls.certificate", &self.certificate),
+            (
+                "tls.client_ca",
+                &self.client_ca,
+                "tls.certificate",
+                &self.certificate,
+            ),
+        ];
+        for (key, value, needed, other) in pairs {
+            if value.is_some() && other.is_none() {
+                return Err(SettingsError::Incomplete { key, needed });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Who may use the server.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AccessSettings {
+    /// The file with identities and their roles. Without one, whoever reaches the server may do everything.
+    pub file: Option<PathBuf>,
+    /// The file that is appended to when somebody does something that matters.
+    pub audit: Option<PathBuf>,
+    /// Whether to listen for other machines even without TLS and identities.
+    pub insecure: bool,
+}
+
+/// Browsers and monitoring.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HttpSettings {
+    /// Origins of pages that may call the server from a browser, beside those that it serves itself.
+    pub allowed_origins: Vec<String>,
+    /// Whether /metrics asks for no credentials.
+    pub open_metrics: bool,
 }
 
 /// Form of a log line.
@@ -186,6 +277,14 @@ pub struct Overrides {
     pub log_format: Option<LogFormat>,
     /// See [`LogSettings::filter`].
     pub log_filter: Option<String>,
+    /// See [`TlsSettings::certificate`].
+    pub tls_certificate: Option<PathBuf>,
+    /// See [`TlsSettings::key`].
+    pub tls_key: Option<PathBuf>,
+    /// See [`AccessSettings::file`].
+    pub access: Option<PathBuf>,
+    /// See [`AccessSettings::insecure`].
+    pub insecure: Option<bool>,
 }
 
 /// Settings that cannot be used; the message names the key and where it was set.
@@ -203,6 +302,25 @@ pub enum SettingsError {
         found: String,
         /// What would do.
         expected: &'static str,
+    },
+    /// A setting needs another.
+    #[error("settings: {key} is set without {needed}")]
+    Incomplete {
+        /// The key that is set.
+        key: &'static str,
+        /// The key that is not.
+        needed: &'static str,
+    },
+    /// Other machines could reach a server that asks them for nothing.
+    #[error(
+        "settings: listen is {address}, which other machines reach, without {missing}; set what is missing (see \
+         `emp-server cert` and `emp-server token add`), listen on 127.0.0.1, or say --insecure"
+    )]
+    Exposed {
+        /// The address.
+        address: SocketAddr,
+        /// What is missing.
+        missing: &'static str,
     },
 }
 
@@ -236,14 +354,44 @@ impl Settings {
             .set_override_option("weights", overrides.weights.map(path))?
             .set_override_option("log.format", overrides.log_format.map(LogFormat::name))?
             .set_override_option("log.filter", overrides.log_filter)?
+            .set_override_option("tls.certificate", overrides.tls_certificate.map(path))?
+            .set_override_option("tls.key", overrides.tls_key.map(path))?
+            .set_override_option("access.file", overrides.access.map(path))?
+            .set_override_option("access.insecure", overrides.insecure)?
             .build()?
             .try_deserialize()?;
         settings.check()?;
         Ok(settings)
     }
 
+    /// Refuses to listen for other machines without TLS and identities, unless that was asked for.
+    pub(crate) fn check_exposure(&self) -> Result<(), SettingsError> {
+        let missing = match (&self.tls.certificate, &self.access.file) {
+            (Some(_), Some(_)) => return Ok(()),
+            (None, Some(_)) => "tls.certificate",
+            (Some(_), None) => "access.file",
+            (None, None) => "tls.certificate and access.file",
+        };
+        if self.listen.ip().to_canonical().is_loopback() || self.access.insecure {
+            return Ok(());
+        }
+        Err(SettingsError::Exposed {
+            address: self.listen,
+            missing,
+        })
+    }
+
     fn check(&self) -> Result<(), SettingsError> {
         self.teleoperation.check()?;
+        self.tls.check()?;
+        let handshake = self.connections.handshake_seconds;
+        if !(SHORTEST_WAIT..=LONGEST_WAIT).contains(&handshake) {
+            return Err(SettingsError::Range {
+                key: "connections.handshake_seconds",
+                found: handshake.to_string(),
+                expected: "0.05 to 60 seconds",
+            });
+        }
         let grace = self.shutdown.grace_seconds;
         if Duration::try_from_secs_f64(grace).is_err() {
             let (key, expected) = ("shutdown.grace_seconds", "zero or more seconds");
@@ -353,7 +501,41 @@ mod tests {
             let refused = message(&format!("[teleoperation]\n{setting}"));
             assert!(refused.contains(key), "{setting}: {refused}");
         }
+        assert!(message("[tls]\ncertificate = \"a.pem\"").contains("tls.key"));
+        assert!(message("[connections]\nhandshake_seconds = 0.0").contains("handshake_seconds"));
         let unknown = layered(None, &[("EMP_SERVER__LISTN", "x")], Overrides::default());
         assert!(unknown.expect_err("refused").to_string().contains("listn"));
+    }
+
+    #[test]
+    fn a_server_that_asks_for_nothing_listens_for_its_own_machine_alone() {
+        let exposed = |file: &str, insecure: bool| {
+            let overrides = Overrides {
+                insecure: Some(insecure),
+                ..Overrides::default()
+            };
+            let settings = layered(Some(file), &[], overrides).expect("sound");
+            settings.check_exposure().map_err(|error| error.to_string())
+        };
+        let tls = "[tls]\ncertificate = \"a\"\nkey = \"b\"\n";
+        let access = "[access]\nfile = \"c\"\n";
+        for own in [
+            "127.0.0.1:1",
+            "[::1]:1",
+            "127.8.8.8:1",
+            "[::ffff:127.0.0.1]:1",
+        ] {
+            assert_eq!(exposed(&format!("listen = \"{own}\""), false), Ok(()));
+        }
+        for other in ["0.0.0.0:1", "[::]:1", "192.0.2.1:1", "[::ffff:192.0.2.1]:1"] {
+            let listen = format!("listen = \"{other}\"\n");
+            let missing =
+                |rest: &str| exposed(&format!("{listen}{rest}"), false).expect_err("refused");
+            assert!(missing("").contains("tls.certificate and access.file"));
+            assert!(missing(tls).contains("without access.file"));
+            assert!(missing(access).contains("without tls.certificate"));
+            assert_eq!(exposed(&format!("{listen}{tls}{access}"), false), Ok(()));
+            assert_eq!(exposed(&listen, true), Ok(()));
+        }
     }
 }

@@ -24,6 +24,7 @@ use super::{
 };
 use crate::{
     error::{FieldError, ServiceError},
+    identity::Role,
     wire,
 };
 
@@ -143,6 +144,7 @@ async fn read_plan(
     let Some(Request::Config(config)) = first.and_then(|first| first.message) else {
         return Err(FieldError::missing_config().into());
     };
+    context.caller.may(Role::Evaluator, &config.robot, "")?;
     let robot = Arc::clone(context.catalog.robot_for(&config.robot)?);
     let environment = read_environment(&config, &robot)?;
     let number = u64::from(read::within(

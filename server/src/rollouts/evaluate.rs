@@ -28,6 +28,7 @@ use super::{
 use crate::{
     catalog::{PolicyModel, RetargetModel},
     error::{FieldError, ServiceError},
+    identity::Role,
     pose, wire,
 };
 
@@ -184,6 +185,7 @@ async fn read_plan(
     let Some(Request::Config(config)) = first.and_then(|first| first.message) else {
         return Err(FieldError::missing_config().into());
     };
+    context.caller.may(Role::Evaluator, &config.robot, "")?;
     let policy = context
         .catalog
         .policy_for(&config.robot, &config.model, &config.model_version)?;

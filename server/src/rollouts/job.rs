@@ -16,7 +16,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-use crate::{deadline, error::ServiceError, settings::RolloutSettings};
+use crate::{deadline, error::ServiceError, metrics::metrics, settings::RolloutSettings};
 
 /// Messages that wait for a slow reader before its job stops.
 const OUTBOUND: usize = 16;
@@ -35,9 +35,16 @@ pub(crate) struct Place {
     threads: usize,
 }
 
+impl Drop for Place {
+    fn drop(&mut self) {
+        metrics().job_ended();
+    }
+}
+
 impl Jobs {
     pub(crate) fn new(settings: &RolloutSettings) -> Self {
         let places = settings.max_jobs.get().min(Semaphore::MAX_PERMITS);
+        metrics().job_places(places);
         let cores = thread::available_parallelism().map_or(1, usize::from);
         Self {
             places: Arc::new(Semaphore::new(places)),
@@ -57,6 +64,7 @@ impl Jobs {
                     what: "as many rollout jobs run as the server allows",
                     retry: RETRY,
                 })?;
+        metrics().job_began();
         Ok(Place {
             _permit: permit,
             threads: self.threads,

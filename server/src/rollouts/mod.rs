@@ -20,7 +20,9 @@ use tonic::{Request, Response, Status, Streaming, metadata::MetadataMap};
 use tracing::Instrument as _;
 
 use self::job::{Jobs, Line};
-use crate::{catalog::Catalog, deadline, error::ServiceError, settings::RolloutSettings};
+use crate::{
+    catalog::Catalog, deadline, error::ServiceError, identity::Caller, settings::RolloutSettings,
+};
 
 /// The service.
 pub(crate) struct Rollouts {
@@ -35,9 +37,17 @@ struct RolloutContext {
     jobs: Arc<Jobs>,
     /// Most frames of motion that a call may send.
     max_frames: usize,
+    caller: Caller,
 }
 
 impl RolloutContext {
+    fn called_by<T>(&self, request: &Request<T>) -> Self {
+        Self {
+            caller: Caller::of(request.extensions()),
+            ..self.clone()
+        }
+    }
+
     fn budget(&self) -> read::Budget {
         read::Budget::new(self.max_frames)
     }
@@ -55,6 +65,7 @@ impl Rollouts {
             catalog,
             jobs: Arc::new(Jobs::new(settings)),
             max_frames: settings.max_frames.get(),
+            caller: Caller::nobody(),
         };
         Self { context, drain }
     }
@@ -81,7 +92,8 @@ impl RolloutService for Rollouts {
         request: Request<Streaming<EvaluateRequest>>,
     ) -> Result<Response<Answers<EvaluateResponse>>, Status> {
         let (line, answers) = self.open(request.metadata())?;
-        let call = evaluate::run(self.context.clone(), request.into_inner(), line);
+        let context = self.context.called_by(&request);
+        let call = evaluate::run(context, request.into_inner(), line);
         tokio::spawn(call.in_current_span());
         Ok(Response::new(answers))
     }
@@ -93,7 +105,8 @@ impl RolloutService for Rollouts {
         request: Request<Streaming<CollectRolloutsRequest>>,
     ) -> Result<Response<Answers<CollectRolloutsResponse>>, Status> {
         let (line, answers) = self.open(request.metadata())?;
-        let call = collect::run(self.context.clone(), request.into_inner(), line);
+        let context = self.context.called_by(&request);
+        let call = collect::run(context, request.into_inner(), line);
         tokio::spawn(call.in_current_span());
         Ok(Response::new(answers))
     }

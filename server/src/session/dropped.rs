@@ -2,7 +2,7 @@
 
 use emp_proto::v1::{DropReason, DroppedFrame, FrameHeader};
 
-use crate::{batcher::Rejected, error::FieldError, queue::JobError};
+use crate::{batcher::Rejected, error::FieldError, metrics::metrics, queue::JobError};
 
 /// A frame was not computed.
 #[derive(Debug, PartialEq)]
@@ -32,6 +32,7 @@ impl NotComputed {
 
     /// The message about the frame with this header.
     pub(crate) fn notice(self, header: Option<FrameHeader>) -> DroppedFrame {
+        metrics().frame_dropped(self.reason.as_str_name());
         DroppedFrame {
             header,
             reason: self.reason.into(),

@@ -16,6 +16,7 @@ use crate::{
     catalog::{Catalog, FilterModel},
     control::{ControlInput, EmpMode, FilterOutput, Filters},
     error::{FieldError, ServiceError},
+    identity::Role,
     queue::Answer,
     robot_state::{self, ControlPeriod},
     wire,
@@ -45,6 +46,7 @@ fn response(message: Response) -> StreamFilterGoalResponse {
 }
 
 impl Kind for FilterStream {
+    const ROLE: Role = Role::Robot;
     type Request = StreamFilterGoalRequest;
     type Response = StreamFilterGoalResponse;
     type Config = StreamFilterGoalConfig;

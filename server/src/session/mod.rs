@@ -24,11 +24,14 @@ use crate::{
     catalog::{Catalog, Served},
     deadline,
     error::{FieldError, ServiceError},
+    identity::{Caller, Role},
     queue::{Answer, Outcome, Priority},
 };
 
 /// What differs between the kinds of streams: their messages, their model, and what they remember from frame to frame.
 pub(crate) trait Kind: Sized + Send + 'static {
+    /// What the caller has to be for the robot.
+    const ROLE: Role;
     /// A message from the client.
     type Request: Send + 'static;
     /// A message to the client.
@@ -107,6 +110,8 @@ pub(crate) struct SessionContext {
     pub(crate) drain: CancellationToken,
     /// When the call must have ended.
     pub(crate) deadline: Option<Instant>,
+    /// Whose stream it is.
+    pub(crate) caller: Caller,
 }
 
 /// Serves one stream to its end. Returns at once when the client is gone, which cancels what is still queued.
@@ -233,6 +238,7 @@ impl<K: Kind> Session<K> {
     fn open(context: &SessionContext, config: &K::Config) -> Result<Self, ServiceError> {
         let delivery = read_delivery(K::delivery(config))?;
         let model = K::model(&context.catalog, config)?;
+        context.caller.may(K::ROLE, &model.card.robot, "")?;
         let kind = K::open(config, model)?;
         check_room(&model.batcher)?;
         tracing::info!(model = model.card.name, ?delivery, "stream started");

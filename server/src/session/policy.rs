@@ -14,6 +14,7 @@ use crate::{
     catalog::{Catalog, PolicyModel},
     control::{ControlInput, Controllers, EmpMode, PolicyOutput},
     error::{FieldError, ServiceError},
+    identity::Role,
     queue::Answer,
     robot_state::{self, ControlPeriod},
     wire,
@@ -42,6 +43,7 @@ fn response(message: Response) -> StreamPolicyResponse {
 }
 
 impl Kind for PolicyStream {
+    const ROLE: Role = Role::Robot;
     type Request = StreamPolicyRequest;
     type Response = StreamPolicyResponse;
     type Config = StreamPolicyConfig;

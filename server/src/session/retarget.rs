@@ -14,6 +14,7 @@ use super::{Incoming, Kind};
 use crate::{
     catalog::{Catalog, RetargetModel},
     error::{FieldError, ServiceError},
+    identity::Role,
     pose,
     queue::Answer,
     wire,
@@ -35,6 +36,7 @@ fn response(message: Response) -> StreamRetargetResponse {
 }
 
 impl Kind for RetargetStream {
+    const ROLE: Role = Role::Observer;
     type Request = StreamRetargetRequest;
     type Response = StreamRetargetResponse;
     type Config = StreamRetargetConfig;

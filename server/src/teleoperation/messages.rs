@@ -11,7 +11,7 @@ use emp_proto::v1::{
 use emp_robot::Robot;
 
 use super::{Role, sessions::Member};
-use crate::{catalog::RetargetModel, control::EmpMode, wire};
+use crate::{catalog::RetargetModel, control::EmpMode, metrics::metrics, wire};
 
 fn response(message: Message) -> TeleoperateResponse {
     TeleoperateResponse {
@@ -88,6 +88,7 @@ pub(super) fn guard_report(
     let names = limited
         .iter()
         .map(|&index| robot.goal_joints()[index].name.clone());
+    metrics().guard_period(phase.as_str_name());
     v1::GuardReport {
         phase: phase.into(),
         cause: cause.into(),

@@ -4,6 +4,7 @@
 //! channel on which everybody is told what the robot executes. The robot's stream ([`robot`]) sets the pace: each of its frames
 //! goes down the [`path`] once. Operators and observers ([`listener`]) bring poses, or nothing, and listen.
 
+mod falls;
 mod inbox;
 mod listener;
 mod messages;
@@ -30,7 +31,7 @@ use crate::{
     catalog::PolicyModel,
     control::EmpMode,
     error::{FieldError, ServiceError},
-    robot_state,
+    identity, robot_state,
     session::{self, SessionContext},
 };
 
@@ -59,6 +60,25 @@ impl Role {
                 let field = "config.role";
                 Err(FieldError::not_in("TeleoperationRole", field, number))
             }
+        }
+    }
+
+    /// What a caller has to be.
+    fn needs(self) -> &'static [identity::Role] {
+        match self {
+            Self::Both => &[identity::Role::Operator, identity::Role::Robot],
+            Self::Operator => &[identity::Role::Operator],
+            Self::Robot => &[identity::Role::Robot],
+            Self::Observer => &[identity::Role::Observer],
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Both => "both",
+            Self::Operator => "operator",
+            Self::Robot => "robot",
+            Self::Observer => "observer",
         }
     }
 
@@ -128,6 +148,8 @@ fn frame_of(request: TeleoperateRequest) -> Result<TeleoperationFrame, FieldErro
 
 /// A stream that is in its session.
 struct Joined {
+    /// Among the sessions that the caller may be in.
+    _place: identity::Place,
     member: Member,
     policy: Arc<PolicyModel>,
     retargeting: Arc<Retargeting>,
@@ -141,6 +163,12 @@ impl Joined {
     ) -> Result<Self, ServiceError> {
         let role = Role::read(config.role)?;
         check_name(&config.session, role)?;
+        for needed in role.needs() {
+            context
+                .caller
+                .may(*needed, &config.robot, &config.session)?;
+        }
+        let place = context.caller.enter_session()?;
         session::read_delivery(config.delivery)?;
         let catalog = &context.catalog;
         let policy = catalog.policy_for(&config.robot, &config.policy, &config.policy_version)?;
@@ -163,7 +191,12 @@ impl Joined {
         if let Some(mode) = mode.filter(|_| role != Role::Observer) {
             member.set_emp_mode(mode);
         }
+        context.caller.record(
+            "session joined",
+            serde_json::json!({"session": config.session, "robot": config.robot, "role": role.name()}),
+        );
         Ok(Self {
+            _place: place,
             member,
             policy: Arc::clone(policy),
             retargeting: Arc::new(Retargeting {

@@ -15,7 +15,9 @@ use emp_proto::v1::{DroppedFrame, FrameHeader, PoseReport, TeleoperatedFrame, Ti
 use nalgebra::UnitQuaternion;
 
 use super::{
-    Joined, messages,
+    Joined,
+    falls::FallWatch,
+    messages,
     sessions::{NewestPose, Retargeting},
 };
 use crate::{
@@ -54,6 +56,7 @@ pub(super) struct Path<'a> {
     emp_mode: EmpMode,
     /// The past as far as it was answered, with the guard after the EMP.
     past: ControllerState,
+    falls: FallWatch,
 }
 
 impl<'a> Path<'a> {
@@ -68,6 +71,7 @@ impl<'a> Path<'a> {
             person: Person::default(),
             guard: GoalGuard::new(robot, settings),
             emp_mode: joined.member.emp_mode(),
+            falls: FallWatch::default(),
             past: state.with_guard(ExecutionGuard::new(robot, settings)),
         }
     }
@@ -79,6 +83,8 @@ impl<'a> Path<'a> {
     ) -> Result<TeleoperatedFrame, DroppedFrame> {
         let now = Instant::now();
         self.begin(&mut frame, now);
+        let robot = &self.joined.policy.card.robot;
+        self.falls.look(&frame.orientation, robot);
         let pose = self.take_pose(now, frame.deadline).await;
         // What follows leaves no trace if the frame is dropped.
         let mut guard = self.guard.clone();

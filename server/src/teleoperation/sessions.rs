@@ -15,6 +15,7 @@ use crate::{
     catalog::RetargetModel,
     control::EmpMode,
     error::{FieldError, ServiceError},
+    metrics::metrics,
 };
 
 /// Every open session that has a name.
@@ -110,6 +111,7 @@ impl Sessions {
             Entry::Vacant(entry) => {
                 let hub = Arc::new(Hub::new(name, robot, emp_mode, self.buffer));
                 let member = hub.take_seat(role, Some(Arc::clone(self)))?;
+                metrics().session_opened();
                 entry.insert(Open { hub, members: 1 });
                 Ok(member)
             }
@@ -178,6 +180,11 @@ impl Hub {
     }
 
     fn change_presence(&self, shared: &mut Shared, role: Role, is_there: bool) {
+        if is_there {
+            metrics().member_joined(role.name());
+        } else {
+            metrics().member_left(role.name());
+        }
         let presence = &mut shared.presence;
         if role.has_robot() {
             presence.robot = is_there;
@@ -271,6 +278,7 @@ impl Drop for Member {
             entry.get_mut().members -= 1;
             if entry.get().members == 0 {
                 entry.remove();
+                metrics().session_closed();
             }
         }
     }

@@ -8,6 +8,7 @@
 pub mod emp;
 pub mod fake;
 pub mod load;
+pub mod network;
 pub mod policy;
 pub mod process;
 pub mod raw;
@@ -120,6 +121,11 @@ impl TestServer {
     /// The server's URL.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
+    }
+
+    /// Where the server listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
     }
 
     /// The server's port.

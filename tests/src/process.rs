@@ -60,13 +60,20 @@ impl ServerProcess {
         Self::start_with(folder, &[])
     }
 
-    /// [`start`](Self::start) with further arguments.
+    /// [`start`](Self::start) with further arguments; also another `--listen`.
     ///
     /// # Errors
     /// When it does not start.
     pub fn start_with(folder: &Path, arguments: &[&OsStr]) -> anyhow::Result<Self> {
+        let listen = [OsStr::new("--listen"), OsStr::new("127.0.0.1:0")];
+        let own: &[&OsStr] = if arguments.contains(&listen[0]) {
+            &[]
+        } else {
+            &listen
+        };
         let mut child = Command::new(binaries()?.join("emp-server"))
-            .args(["--listen", "127.0.0.1:0", "--log-format", "json"])
+            .args(["--log-format", "json"])
+            .args(own)
             .args(arguments)
             .current_dir(folder)
             .stdout(Stdio::piped())

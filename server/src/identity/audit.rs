@@ -14,10 +14,9 @@ use std::{
     time::Duration,
 };
 
-use serde_json::{Value, json};
+use serde_json::{Map, Value};
 use time::{OffsetDateTime, format_description::well_known::Rfc3339};
 
-use super::Caller;
 use crate::{lines::Lines, metrics::metrics};
 
 /// How long the end of the server may wait for the last lines.
@@ -46,7 +45,10 @@ impl Audit {
             file: Some(append(path)?),
             reopen: Arc::clone(&reopen),
         };
-        let note = |count| line("lines left out", json!({ "count": count }));
+        let note = |count: u64| {
+            let count = ("count".to_owned(), count.into());
+            line("lines left out", Map::from_iter([count]))
+        };
         let lines = Lines::start("audit", file, note)?;
         Ok(Self(Some(Arc::new(Running { lines, reopen }))))
     }
@@ -64,27 +66,20 @@ impl Audit {
         }
     }
 
-    pub(super) fn record(&self, caller: &Caller, event: &str, mut facts: Value) {
-        let Some(running) = &self.0 else { return };
-        if let Value::Object(facts) = &mut facts {
-            facts.insert("identity".to_owned(), caller.identity.name().into());
-            facts.insert("request".to_owned(), caller.request.as_ref().into());
-            let peer = caller.peer.map(|peer| peer.to_string());
-            facts.insert("peer".to_owned(), peer.into());
-        }
-        if !running.lines.push(line(event, facts)) {
+    pub(super) fn record(&self, event: &str, facts: Map<String, Value>) {
+        if let Some(running) = &self.0
+            && !running.lines.push(line(event, facts))
+        {
             metrics().audit_line_left_out();
         }
     }
 }
 
-fn line(event: &str, mut facts: Value) -> Vec<u8> {
+fn line(event: &str, mut facts: Map<String, Value>) -> Vec<u8> {
     let time = OffsetDateTime::now_utc().format(&Rfc3339).ok();
-    if let Value::Object(facts) = &mut facts {
-        facts.insert("event".to_owned(), event.into());
-        facts.insert("time".to_owned(), time.into());
-    }
-    format!("{facts}\n").into_bytes()
+    facts.insert("event".to_owned(), event.into());
+    facts.insert("time".to_owned(), time.into());
+    format!("{}\n", Value::Object(facts)).into_bytes()
 }
 
 fn append(path: &Path) -> io::Result<File> {

@@ -13,8 +13,9 @@ use subtle::ConstantTimeEq as _;
 use tokio_util::sync::CancellationToken;
 
 use super::{
-    AccessError, AccessFile, Identity, Patterns,
-    file::{Entry, digest},
+    file::{AccessError, AccessFile, Entry, digest},
+    patterns::Patterns,
+    principal::Identity,
 };
 use crate::error::ServiceError;
 

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use time::{OffsetDateTime, format_description::well_known::Rfc3339};
 
-use super::{Role, quota::Quota};
+use super::{quota::Quota, role::Role};
 
 /// What a token starts with, so that tools that look for leaked secrets know one.
 const PREFIX: &str = "emp_";

@@ -1,6 +1,6 @@
 //! The table of every method: the least role that may call it, and what it counts as. What is not in it cannot be called.
 
-use super::Role;
+use super::role::Role;
 
 /// Who may call a method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -15,7 +15,7 @@ use http_body::{Body as HttpBody, Frame, SizeHint};
 use tokio::time::{Instant, Sleep, sleep_until};
 use tonic::{Code, Status};
 
-use super::call::Open;
+use super::open::Open;
 use crate::{
     error::ServiceError,
     identity::{Identity, methods::Kind},

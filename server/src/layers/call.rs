@@ -1,6 +1,6 @@
 //! The layer around every gRPC call: whose it is, whether that may call it, quotas, metrics, the audit log.
 
-use std::{sync::Arc, time::Instant};
+use std::sync::Arc;
 
 use axum::{
     body::Body,
@@ -13,53 +13,18 @@ use tonic::Status;
 use super::{
     Gate,
     body::{Inbound, Outbound},
+    open::Open,
     request::RequestId,
 };
 use crate::{
     error::ServiceError,
     identity::{
-        Caller, Place,
-        methods::{self, Kind, Method, Needs},
+        Caller,
+        methods::{self, Needs},
     },
     metrics::metrics,
     network::Peer,
 };
-
-/// A call that was let in, until it ends.
-pub(super) struct Open {
-    pub(super) method: &'static Method,
-    pub(super) caller: Caller,
-    began: Instant,
-    _place: Place,
-}
-
-impl Open {
-    fn begin(method: &'static Method, caller: Caller, place: Place) -> Self {
-        metrics().call_began(method.path);
-        if method.audited {
-            caller.record("call", serde_json::json!({"method": method.path}));
-        }
-        Self {
-            method,
-            caller,
-            began: Instant::now(),
-            _place: place,
-        }
-    }
-
-    pub(super) fn end(&self, code: &'static str) {
-        let time = self.began.elapsed();
-        let single = (self.method.kind == Kind::Call).then_some(time);
-        metrics().call_ended(self.method.path, code, single);
-        let seconds = time.as_secs_f64();
-        tracing::debug!(method = self.method.path, code, seconds, "call ended");
-        if self.method.audited {
-            let facts =
-                serde_json::json!({"method": self.method.path, "code": code, "seconds": seconds});
-            self.caller.record("call ended", facts);
-        }
-    }
-}
 
 pub(crate) async fn layer(
     State(gate): State<Arc<Gate>>,

@@ -4,8 +4,9 @@
 //! 2. The pages that are not gRPC (`http`), or gRPC-Web made gRPC.
 //! 3. [`call`]: whose call it is, whether that may call it, quotas, metrics, the audit log.
 
-pub(crate) mod body;
+mod body;
 pub(crate) mod call;
+mod open;
 pub(crate) mod request;
 
 use std::sync::Arc;

@@ -35,6 +35,8 @@ mod rollouts;
 mod serve;
 mod session;
 mod settings;
+#[cfg(feature = "otel")]
+mod telemetry;
 mod teleoperation;
 mod wire;
 

@@ -13,6 +13,9 @@ use tracing_subscriber::{
     EnvFilter, Layer, fmt::MakeWriter, layer::SubscriberExt as _, util::SubscriberInitExt as _,
 };
 
+#[cfg(feature = "otel")]
+use tracing_subscriber::filter::LevelFilter;
+
 use crate::{
     lines::Lines,
     metrics::{LeftOut, metrics},
@@ -30,10 +33,12 @@ const LAST_LINES: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct Log {
     lines: Lines,
+    #[cfg(feature = "otel")]
+    _telemetry: crate::telemetry::Telemetry,
 }
 
 impl Log {
-    /// Starts the log on standard error. A panic anywhere becomes a line of it.
+    /// Starts the log on standard error. A panic anywhere becomes a line of it. Has to be called inside a tokio runtime.
     ///
     /// # Errors
     /// When the filter is none, or a log was started before.
@@ -50,13 +55,21 @@ impl Log {
             LogFormat::Json => layer.json().boxed(),
         };
         let registry = tracing_subscriber::registry().with(layer.with_filter(filter));
+        #[cfg(feature = "otel")]
+        let telemetry = crate::telemetry::Telemetry::start()?;
+        #[cfg(feature = "otel")]
+        let registry = registry.with(telemetry.layer().with_filter(LevelFilter::INFO));
         registry.try_init().context("the log")?;
         std::panic::set_hook(Box::new(|panic| {
             let place = panic.location().map(ToString::to_string);
             let message = panic.payload_as_str().unwrap_or("without a message");
             tracing::error!(place, message, "panic");
         }));
-        Ok(Self { lines })
+        Ok(Self {
+            lines,
+            #[cfg(feature = "otel")]
+            _telemetry: telemetry,
+        })
     }
 }
 

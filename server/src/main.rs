@@ -103,14 +103,15 @@ fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     if let Some(command) = arguments.command {
         return commands::run(command, &settings);
     }
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .context("tokio runtime")?;
+    let _inside = runtime.enter();
     let _log = Log::start(&settings.log)?;
     system::raise_descriptor_limit(settings.connections.max.get());
     let catalog = Catalog::load(&settings)?;
-    tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        .build()
-        .context("tokio runtime")?
-        .block_on(serve(settings, catalog))
+    runtime.block_on(serve(settings, catalog))
 }
 
 async fn serve(settings: Settings, catalog: Catalog) -> anyhow::Result<ExitCode> {

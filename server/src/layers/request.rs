@@ -88,6 +88,8 @@ pub(crate) async fn layer(
     if let Some(trace) = trace_id(request.headers()) {
         span.record("trace", trace);
     }
+    #[cfg(feature = "otel")]
+    crate::telemetry::continue_trace(&span, request.headers());
     let header = HeaderValue::from_str(&id.0);
     request.extensions_mut().insert(id);
     let mut response = if may_come_from(request.headers(), request.uri(), &gate) {

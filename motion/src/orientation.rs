@@ -12,15 +12,20 @@ const TRUNK_WEIGHT: f64 = 0.5;
 /// The trunk's weight where it is alone.
 const TRUNK_ALONE_WEIGHT: f64 = 1.5;
 /// Weight of the rest pose, which in some files keeps another axis up than the motion.
-const REST_WEIGHT: f64 = 0.75;
-/// Weight of the share of poses that stand on a floor at zero.
+const REST_WEIGHT: f64 = 1.25;
+/// Weight of standing on a floor at zero, and of having the feet deep below it while the file counts heights from it.
 const FLOOR_WEIGHT: f64 = 1.0;
 /// Weight of the axis that a format prescribes or its files say.
 const PRIOR_WEIGHT: f64 = 0.75;
-/// The floor lies within this share of a body's size from zero, …
-const FLOOR_BAND: f64 = 0.04;
+/// The lowest point lies within about this share of a body's size from the floor, …
+const FLOOR_BAND: f64 = 0.1;
 /// … and the waist at least this share above it.
 const WAIST_ABOVE_FLOOR: f64 = 0.08;
+/// A body whose lowest point is farther below zero than this share of its size is buried.
+const BURIED: f64 = 0.25;
+/// Shares of a body's size between which a waist's height over a floor lies, and how far it strays.
+const WAIST_HEIGHT: std::ops::Range<f64> = 0.2..0.9;
+const WAIST_STRAYS: f64 = 0.12;
 /// Two axes whose scores are nearer than this are both likely.
 const CLEAR_LEAD: f64 = 0.3;
 /// Cosine between trunk and legs above which a rest pose stands upright.
@@ -95,13 +100,14 @@ pub(crate) fn up_axis(
     rest: Option<&Probe>,
     prior: Option<UpAxis>,
 ) -> (UpAxis, Option<String>) {
+    let from_floor = UpAxis::ALL
+        .iter()
+        .any(|axis| counts_from_floor(*axis, probes));
     let mut scored = UpAxis::ALL.map(|axis| {
-        let told = if prior == Some(axis) {
-            PRIOR_WEIGHT
-        } else {
-            0.0
-        };
-        (score(axis, probes, rest) + told, axis)
+        let told = f64::from(u8::from(prior == Some(axis)));
+        let buried = f64::from(u8::from(from_floor)) * buried(axis, probes);
+        let score = score(axis, probes, rest) + PRIOR_WEIGHT * told - FLOOR_WEIGHT * buried;
+        (score, axis)
     });
     scored.sort_by(|a, b| b.0.total_cmp(&a.0));
     let [(first, up), (second, other), ..] = scored;
@@ -124,7 +130,7 @@ fn score(axis: UpAxis, probes: &[Probe], rest: Option<&Probe>) -> f64 {
         None => TRUNK_ALONE_WEIGHT * trunk,
     };
     let rest = rest.and_then(rest_line).map_or(0.0, along);
-    let floor = mean(probes.iter().map(|p| f64::from(u8::from(on_floor(p, &up)))));
+    let floor = mean(probes.iter().map(|p| on_floor(p, &up)));
     let tilt = mean(probes.iter().map(|p| along(p.left).abs()));
     stands + REST_WEIGHT * rest.max(0.0) + FLOOR_WEIGHT * floor - tilt
 }
@@ -138,11 +144,37 @@ fn rest_line(rest: &Probe) -> Option<Vector3<f64>> {
     (legs.try_normalize(1e-9)?.dot(&trunk) > UPRIGHT).then_some(trunk)
 }
 
-fn on_floor(probe: &Probe, up: &Vector3<f64>) -> bool {
+/// The lowest coordinate along an axis.
+fn lowest(probe: &Probe, up: &Vector3<f64>) -> f64 {
     let [low, high] = probe.bounds;
-    let lowest = up.dot(&low).min(up.dot(&high));
-    let size = probe.size();
-    lowest.abs() < FLOOR_BAND * size && up.dot(&probe.waist()) - lowest > WAIST_ABOVE_FLOOR * size
+    up.dot(&low).min(up.dot(&high))
+}
+
+/// How well a pose rests on a floor at zero, 0 to 1.
+fn on_floor(probe: &Probe, up: &Vector3<f64>) -> f64 {
+    let (lowest, size) = (lowest(probe, up), probe.size());
+    if up.dot(&probe.waist()) - lowest > WAIST_ABOVE_FLOOR * size {
+        (-(lowest / (FLOOR_BAND * size)).powi(2)).exp()
+    } else {
+        0.0
+    }
+}
+
+/// The share of poses that reach deep below zero along an axis.
+fn buried(axis: UpAxis, probes: &[Probe]) -> f64 {
+    let up = axis.direction();
+    let deep = |p: &Probe| lowest(p, &up) < -BURIED * p.size();
+    mean(probes.iter().map(|p| f64::from(u8::from(deep(p)))))
+}
+
+/// Whether the waist keeps a person's height over zero along an axis. In a file in which it does so along none, heights
+/// are not counted from a floor.
+fn counts_from_floor(axis: UpAxis, probes: &[Probe]) -> bool {
+    let up = axis.direction();
+    let height = |p: &Probe| up.dot(&p.waist()) / p.size();
+    let middle = mean(probes.iter().map(height));
+    let strays = mean(probes.iter().map(|p| (height(p) - middle).abs()));
+    WAIST_HEIGHT.contains(&middle) && strays < WAIST_STRAYS
 }
 
 /// Whether the body is its own mirror image; `None` where neither legs nor arms tell.

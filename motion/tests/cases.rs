@@ -188,15 +188,29 @@ fn a_bent_trunk_keeps_its_up_axis() {
 
 #[test]
 fn crawling_and_push_ups_keep_their_up_axis() {
-    // The whole body lies along z, 37 cm above a floor at zero, face down.
-    let pushed_up = replaced_root(&text("00_good.bvh"), [0.0, 37.0, 50.0], [0.0, 0.0, 80.0]);
-    let reading = parse(&pushed_up).expect("valid");
-    assert_eq!(
-        reading.understanding.up.as_deref(),
-        Some("y"),
-        "{:?}",
-        reading.understanding.warnings
-    );
+    // The whole body lies along z, face down, at some height over a floor at zero.
+    for (height, lean) in [
+        (37.0, 80.0),
+        (30.0, 80.0),
+        (45.0, 90.0),
+        (95.0, 90.0),
+        (50.0, 70.0),
+        (30.0, 100.0),
+    ] {
+        let lying = replaced_root(&text("00_good.bvh"), [0.0, height, 50.0], [0.0, 0.0, lean]);
+        let reading = parse(&lying).expect("valid");
+        assert_eq!(
+            reading.understanding.up.as_deref(),
+            Some("y"),
+            "{height} {lean}"
+        );
+        let bend = Rotation3::from_axis_angle(&Vector3::y_axis(), (lean as f32).to_radians());
+        for (bent, straight) in reading.clip.frames.iter().zip(&good().frames) {
+            assert!(
+                (bent.upper_arm(Side::Left) - bend * straight.upper_arm(Side::Left)).norm() < 0.02
+            );
+        }
+    }
 }
 
 #[test]

@@ -1,4 +1,5 @@
 //! What the tests of both robots share.
+#![allow(dead_code, reason = "each test binary uses its own part")]
 
 use std::path::{Path, PathBuf};
 

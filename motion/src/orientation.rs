@@ -81,9 +81,52 @@ impl Probe {
         trunk + self.leg_line().map_or(trunk, |line| line.norm())
     }
 
+    /// How far each foot points forward, −1 to 1, where its leg stands.
+    fn toes_forward(&self, up: &Vector3<f64>) -> Vec<f64> {
+        let toe = |leg: &Leg| {
+            let foot = level(leg.toe? - leg.ankle, up).filter(|_| leg.stands(up))?;
+            Some(foot.dot(&self.forward(up)?))
+        };
+        self.legs.iter().flatten().filter_map(toe).collect()
+    }
+
+    /// How far each bent knee points forward, where its leg stands.
+    fn knees_forward(&self, up: &Vector3<f64>) -> Vec<f64> {
+        let knee = |leg: &Leg| {
+            let knee = bend(leg.hip, leg.knee, leg.ankle).filter(|_| leg.stands(up))?;
+            Some(knee.dot(&self.forward(up)?))
+        };
+        self.legs.iter().flatten().filter_map(knee).collect()
+    }
+
+    /// How far each bent elbow of an arm that hangs from an upright trunk points backward.
+    fn elbows_backward(&self, up: &Vector3<f64>) -> Vec<f64> {
+        let trunk = self.shoulders() - self.waist();
+        let elbow = |side: Side| {
+            let [shoulder, elbow, wrist] = side.arm().map(|node| self.positions[node as usize]);
+            // A raised arm may bend any way.
+            let told = is_along(&trunk, up) && (elbow - shoulder).dot(up) < 0.0;
+            let bend = bend(shoulder, elbow, wrist).filter(|_| told)?;
+            Some(-bend.dot(&self.forward(up)?))
+        };
+        Side::BOTH.into_iter().filter_map(elbow).collect()
+    }
+
     fn forward(&self, up: &Vector3<f64>) -> Option<Vector3<f64>> {
         self.left.cross(up).try_normalize(0.2 * self.left.norm())
     }
+}
+
+impl Leg {
+    /// Whether the leg is about upright.
+    fn stands(&self, up: &Vector3<f64>) -> bool {
+        is_along(&(self.hip - self.ankle), up)
+    }
+}
+
+/// Whether a direction is within 60° of another.
+fn is_along(v: &Vector3<f64>, up: &Vector3<f64>) -> bool {
+    v.dot(up) > 0.5 * v.norm()
 }
 
 /// Lowest and highest coordinates of some points.
@@ -186,30 +229,19 @@ pub(crate) fn is_mirrored(
     thumbs: Option<f64>,
 ) -> Option<bool> {
     let up = up.direction();
-    let poses = || probes.iter().chain(rest);
-    let legs = |p: &Probe| p.legs.iter().flatten().copied().collect::<Vec<Leg>>();
-    let toes = sign(poses().flat_map(|p| {
-        let toe = |leg: &Leg| Some(level(leg.toe? - leg.ankle, &up)?.dot(&p.forward(&up)?));
-        legs(p).iter().filter_map(toe).collect::<Vec<f64>>()
-    }));
-    let knees = sign(probes.iter().flat_map(|p| {
-        let knee = |leg: &Leg| Some(bend(leg.hip, leg.knee, leg.ankle)?.dot(&p.forward(&up)?));
-        legs(p).iter().filter_map(knee).collect::<Vec<f64>>()
-    }));
-    let elbows = sign(probes.iter().flat_map(|p| {
-        let elbow = |side: Side| {
-            let [shoulder, elbow, wrist] = side.arm().map(|node| p.positions[node as usize]);
-            // A raised arm may bend any way.
-            let hangs = (elbow - shoulder).dot(&up) < 0.0;
-            let bend = hangs.then(|| bend(shoulder, elbow, wrist))??;
-            Some(-bend.dot(&p.forward(&up)?))
-        };
-        Side::BOTH
-            .into_iter()
-            .filter_map(elbow)
-            .collect::<Vec<f64>>()
-    }));
-    let signs = [(toes, 2.0), (knees, 1.5), (thumbs, 1.0), (elbows, 0.75)];
+    let toes = sign(probes.iter().flat_map(|p| p.toes_forward(&up)));
+    let knees = sign(probes.iter().flat_map(|p| p.knees_forward(&up)));
+    let elbows = sign(probes.iter().flat_map(|p| p.elbows_backward(&up)));
+    // A rest pose may have an up axis of its own.
+    let at_rest = rest.and_then(|rest| Some((rest, rest_line(rest)?)));
+    let toes_at_rest = at_rest.and_then(|(rest, up)| sign(rest.toes_forward(&up).into_iter()));
+    let signs = [
+        (toes, 2.0),
+        (toes_at_rest, 2.0),
+        (knees, 1.5),
+        (thumbs, 1.0),
+        (elbows, 0.75),
+    ];
     let (sum, weight) = signs
         .into_iter()
         .filter_map(|(sign, weight)| Some((sign? * weight, weight)))

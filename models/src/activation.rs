@@ -11,6 +11,20 @@ pub fn elu(x: &Tensor) -> candle_core::Result<Tensor> {
     x.contiguous()?.apply_op1(Elu)
 }
 
+/// Replaces numbers by their ELU.
+pub fn elu_in_place(numbers: &mut [f32]) {
+    Arch::new().dispatch(|| apply_elu(numbers));
+}
+
+/// Turns the gradients of ELU's answers into those of its arguments.
+pub fn elu_slope_in_place(gradients: &mut [f32], answers: &[f32]) {
+    Arch::new().dispatch(|| {
+        for (gradient, answer) in gradients.iter_mut().zip(answers) {
+            *gradient *= answer.min(0.0) + 1.0;
+        }
+    });
+}
+
 struct Elu;
 
 impl CustomOp1 for Elu {
@@ -21,7 +35,7 @@ impl CustomOp1 for Elu {
     fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
         let x = values(x, layout)?;
         let mut out = x.to_vec();
-        Arch::new().dispatch(|| apply_elu(&mut out));
+        elu_in_place(&mut out);
         Ok((CpuStorage::F32(out), layout.shape().clone()))
     }
 
@@ -48,11 +62,7 @@ impl CustomOp2 for Slope {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (y, grad) = (values(y, y_layout)?, values(grad, grad_layout)?);
         let mut out = grad.to_vec();
-        Arch::new().dispatch(|| {
-            for (out, y) in out.iter_mut().zip(y) {
-                *out *= y.min(0.0) + 1.0;
-            }
-        });
+        elu_slope_in_place(&mut out, y);
         Ok((CpuStorage::F32(out), y_layout.shape().clone()))
     }
 }

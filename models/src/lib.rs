@@ -15,6 +15,7 @@ pub mod filters;
 pub mod guard;
 pub mod kinematics;
 pub mod linear;
+pub mod mirror;
 pub mod mlp;
 pub mod observation;
 pub mod optimizer;
@@ -25,3 +26,4 @@ pub mod world_model;
 
 pub use checkpoint::CheckpointMetadata;
 pub use error::ModelError;
+pub use mirror::Mirror;

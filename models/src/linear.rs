@@ -85,6 +85,41 @@ pub fn product_with_transpose(out: &mut [f32], a: &[f32], b: &[f32], k: usize) {
     product(out, Accum::Replace, a, b);
 }
 
+/// `out = aᵀ · b` for row-major `a` (n × m) and `b` (n × k), on the calling thread's [`set_threads`] budget.
+pub fn product_of_transpose(out: &mut [f32], a: &[f32], m: usize, b: &[f32]) {
+    let rows = a.len() / m;
+    let a = Operand {
+        data: a,
+        rows,
+        cols: m,
+        transposed: true,
+    };
+    let b = Operand {
+        data: b,
+        rows,
+        cols: b.len() / rows.max(1),
+        transposed: false,
+    };
+    product(out, Accum::Replace, a, b);
+}
+
+/// `out = a · b` for row-major `a` (n × m) and `b` (m × k), on the calling thread's [`set_threads`] budget.
+pub fn product_plain(out: &mut [f32], a: &[f32], m: usize, b: &[f32]) {
+    let a = Operand {
+        data: a,
+        rows: a.len() / m,
+        cols: m,
+        transposed: false,
+    };
+    let b = Operand {
+        data: b,
+        rows: m,
+        cols: b.len() / m,
+        transposed: false,
+    };
+    product(out, Accum::Replace, a, b);
+}
+
 fn contiguous<'a, T>(data: &'a [T], layout: &Layout) -> candle_core::Result<&'a [T]> {
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&data[start..end]),

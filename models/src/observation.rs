@@ -2,8 +2,11 @@
 //! IV-B; erratum E1).
 //!
 //! A frame is `[q | a_{t−1} | roll, pitch, yaw | g]`: joint positions (goal joints, then leg joints; rad), the last action
-//! (policy units), the orientation of the base (rad; yaw relative to the heading at reset, since the absolute heading
-//! cannot be observed) and the goal (rad). A stack holds its frames oldest first.
+//! (policy units), the orientation of the base (rad; yaw relative to a heading, since the absolute heading cannot be
+//! observed) and the goal (rad). A stack holds its frames oldest first.
+//!
+//! The heading is that at reset; it stays there, or it follows the base slowly, so that a yaw that drifts for an hour
+//! never leaves what a policy has seen.
 
 use std::ops::Range;
 
@@ -30,6 +33,9 @@ pub struct ObservationLayout {
     goals: usize,
     /// Frames in a stack.
     history: usize,
+    /// Control periods in which the heading comes near the base's yaw (a time constant); 0: it stays as at reset.
+    #[serde(default)]
+    heading_periods: u32,
 }
 
 impl ObservationLayout {
@@ -41,7 +47,37 @@ impl ObservationLayout {
             actions,
             goals,
             history: history.max(1),
+            heading_periods: 0,
         }
+    }
+
+    /// The same with a heading that follows the base's yaw with a time constant of so many control periods; 0: it stays as
+    /// at reset.
+    #[must_use]
+    pub fn with_heading_periods(self, heading_periods: u32) -> Self {
+        Self {
+            heading_periods,
+            ..self
+        }
+    }
+
+    /// Control periods in which the heading comes near the base's yaw; 0: it stays as at reset.
+    pub fn heading_periods(&self) -> u32 {
+        self.heading_periods
+    }
+
+    /// Refuses a layout that is not one of `robot`'s stacks, whatever their length and heading.
+    ///
+    /// # Errors
+    /// Says what was expected.
+    pub fn check(&self, robot: &Robot) -> Result<(), String> {
+        let expected = Self::new(robot, self.history).with_heading_periods(self.heading_periods);
+        if *self == expected {
+            return Ok(());
+        }
+        Err(format!(
+            "the observation is {self:?}, expected {expected:?}"
+        ))
     }
 
     /// Numbers in one frame.
@@ -204,7 +240,7 @@ pub struct History {
     /// The stack, oldest frame first.
     frames: Vec<f32>,
     last_action: Vec<f32>,
-    /// Yaw of the base when the episode started, rad; none until it is known.
+    /// What yaw is relative to, rad; none until it is known.
     heading: Option<f64>,
     is_empty: bool,
 }
@@ -233,13 +269,14 @@ impl History {
         self.is_empty
     }
 
-    /// Yaw of the base when the episode started, rad: that of the first frame, unless it was set; none before it.
+    /// What the next frame's yaw is relative to, rad: at first the yaw of the first frame, unless it was set; none before
+    /// it.
     pub fn heading(&self) -> Option<f64> {
         self.heading
     }
 
-    /// Sets the yaw of the base at the episode's start, rad, for a history that does not begin there. Frames that were
-    /// pushed before keep the heading that they had.
+    /// Sets what the next frame's yaw is relative to, rad, for a history that does not begin with the episode. Frames that
+    /// were pushed before keep the heading that they had.
     pub fn set_heading(&mut self, heading: f64) {
         self.heading = Some(heading);
     }
@@ -257,7 +294,12 @@ impl History {
         let newest = &mut self.frames[self.layout.newest()];
         newest[self.layout.joint_positions()].copy_from_slice(state.joint_positions);
         newest[self.layout.last_action()].copy_from_slice(&self.last_action);
-        let orientation = [roll, pitch, wrapped(yaw - heading)].map(|angle| angle as f32);
+        let turned = wrapped(yaw - heading);
+        if self.layout.heading_periods > 0 {
+            let step = turned / f64::from(self.layout.heading_periods);
+            self.heading = Some(heading + step);
+        }
+        let orientation = [roll, pitch, turned].map(|angle| angle as f32);
         newest[self.layout.orientation()].copy_from_slice(&orientation);
         newest[self.layout.goal()].copy_from_slice(goal);
         if is_first {
@@ -400,6 +442,27 @@ mod tests {
             let yaw = frame[layout.orientation()][2];
             assert!((yaw - 0.25).abs() < 1e-6, "{yaw}");
         }
+    }
+
+    #[test]
+    fn a_heading_that_follows_keeps_a_drifting_yaw_near_zero() {
+        let robot = Robot::load("../robots/emp27".as_ref()).unwrap();
+        let layout = layout().with_heading_periods(500);
+        layout.check(&robot).unwrap();
+        let mut history = History::new(layout);
+        // Ten minutes at 0.02 rad/s: twice around.
+        let yaw = |t: usize| 0.0004 * t as f64;
+        let mut farthest: f32 = 0.0;
+        for t in 0..30_000 {
+            let state = RobotState {
+                joint_positions: &[0.0; 27],
+                orientation: yawed(yaw(t)),
+            };
+            history.push(&state, &[0.0; 15]);
+            farthest = farthest.max(history.newest()[layout.orientation()][2].abs());
+        }
+        // The drift of one time constant.
+        assert!((0.19..0.21).contains(&farthest), "{farthest}");
     }
 
     #[test]

@@ -87,20 +87,42 @@ impl Adam {
     /// When a gradient is not f32, or not a number: the variables are then left as they were.
     pub fn step(&mut self, grads: &GradStore, learning_rate: f64) -> candle_core::Result<f64> {
         let mut found = Vec::with_capacity(self.slots.len());
-        let mut squared_norm = 0.0;
         for slot in self.slots.values() {
-            let grad = grads
-                .get(&slot.var)
-                .map(|g| g.flatten_all()?.to_vec1::<f32>())
-                .transpose()?;
-            squared_norm += grad
-                .iter()
-                .flatten()
-                .map(|g| f64::from(*g).powi(2))
-                .sum::<f64>();
-            found.push(grad);
+            let grad = grads.get(&slot.var);
+            found.push(
+                grad.map(|g| g.flatten_all()?.to_vec1::<f32>())
+                    .transpose()?,
+            );
         }
-        let norm = squared_norm.sqrt();
+        self.apply(&found, learning_rate)
+    }
+
+    /// As [`step`](Self::step), with gradients by the names of their variables.
+    ///
+    /// # Errors
+    /// When a gradient is not a number: the variables are then left as they were.
+    pub fn step_by_name(
+        &mut self,
+        mut gradients: BTreeMap<String, Vec<f32>>,
+        learning_rate: f64,
+    ) -> candle_core::Result<f64> {
+        let names = self.slots.keys();
+        let found: Vec<Option<Vec<f32>>> = names.map(|name| gradients.remove(name)).collect();
+        self.apply(&found, learning_rate)
+    }
+
+    /// Takes a step with one gradient a slot, where there is one.
+    fn apply(
+        &mut self,
+        found: &[Option<Vec<f32>>],
+        learning_rate: f64,
+    ) -> candle_core::Result<f64> {
+        let squares = found
+            .iter()
+            .flatten()
+            .flatten()
+            .map(|g| f64::from(*g).powi(2));
+        let norm = squares.sum::<f64>().sqrt();
         if !norm.is_finite() {
             bail!("the gradient is not a number");
         }
@@ -108,7 +130,7 @@ impl Adam {
         self.steps += 1;
         for (slot, grad) in self.slots.values_mut().zip(found) {
             if let Some(grad) = grad {
-                slot.update(&grad, scale, learning_rate, &self.config, self.steps)?;
+                slot.update(grad, scale, learning_rate, &self.config, self.steps)?;
             }
         }
         Ok(norm)

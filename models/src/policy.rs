@@ -7,16 +7,20 @@
 //! The first layer is fixed: it mixes the frames of the stack, the same way for each number of a frame, into the present,
 //! two differences and one deviation from the mean. Raw frames hold the same information, but learning from them took
 //! many times as long.
+//!
+//! A symmetric policy answers π(s) = ½ (f(s) + M f(M s)), f being the network and M the mirror: what it does to the right it
+//! does to the left, bit for bit. Both halves go through the network as rows of one batch. Policies that were trained
+//! before that say nothing of symmetry, and answer f(s).
 
 use std::{path::Path, sync::Arc};
 
 use candle_core::{DType, Device, Tensor};
 use candle_nn::VarBuilder;
-use emp_robot::Robot;
+use emp_robot::{Robot, RobotError};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    CheckpointMetadata, ModelError,
+    CheckpointMetadata, Mirror, ModelError,
     checkpoint::{self, Tensors},
     mlp::{Mlp, Normalizer, shipped_tensors},
     observation::{HISTORY, HistoryMap, ObservationLayout},
@@ -39,15 +43,20 @@ pub struct PolicyConfig {
     pub history_map: HistoryMap,
     /// Widths of the hidden layers.
     pub hidden: Vec<usize>,
+    /// Whether the policy is symmetric by construction.
+    #[serde(default)]
+    pub symmetric: bool,
 }
 
 impl PolicyConfig {
-    /// The shipped shape for `robot`: `s_t`, `s_t` − `s_{t−1}`, `s_{t−1}` − `s_{t−3}` and `s_t` − mean, then `hidden` layers.
+    /// The shape for `robot`: `s_t`, `s_t` − `s_{t−1}`, `s_{t−1}` − `s_{t−3}` and `s_t` − mean, then `hidden` layers; symmetric
+    /// where the robot has a mirror image.
     pub fn new(robot: &Robot, hidden: Vec<usize>) -> Self {
         Self {
             observation: ObservationLayout::new(robot, HISTORY),
             history_map: HistoryMap::differences(),
             hidden,
+            symmetric: robot.mirror().is_ok(),
         }
     }
 
@@ -58,14 +67,68 @@ impl PolicyConfig {
 
     /// Refuses a shape that does not fit `robot`.
     fn check(&self, robot: &Robot) -> Result<(), String> {
-        let expected = ObservationLayout::new(robot, self.observation.history());
-        if self.observation != expected {
-            return Err(format!(
-                "the observation is {:?}, expected {expected:?}",
-                self.observation
-            ));
-        }
+        self.observation.check(robot)?;
         self.history_map.check(&self.observation)
+    }
+}
+
+/// What makes a policy symmetric.
+#[derive(Clone, Debug)]
+pub struct PolicyMirror {
+    /// The mirror of the network's features.
+    pub features: Mirror,
+    /// The mirror of actions.
+    pub actions: Mirror,
+}
+
+impl PolicyMirror {
+    /// The mirror for `config`'s features of `robot`: the history map mixes whole frames, so its blocks turn as frames do.
+    /// None where the policy is not symmetric.
+    ///
+    /// # Errors
+    /// When the policy is symmetric and the robot has no mirror image.
+    pub fn new(robot: &Robot, config: &PolicyConfig) -> Result<Option<Self>, RobotError> {
+        if !config.symmetric {
+            return Ok(None);
+        }
+        let layout = &config.observation;
+        let blocks = config.features() / layout.frame_width();
+        Ok(Some(Self {
+            features: Mirror::frame(robot, layout)?.repeated(blocks),
+            actions: Mirror::leg_joints(&robot.mirror()?),
+        }))
+    }
+
+    /// ½ (f(s) + M f(M s)) of answers f(s) (N rows) followed by the answers f(M s) to the mirrored rows.
+    pub fn fold(&self, answers: &[f32]) -> Vec<f32> {
+        let width = self.actions.width();
+        let (seen, mirrored) = answers.split_at(answers.len() / 2);
+        let rows = seen.chunks_exact(width).zip(mirrored.chunks_exact(width));
+        let folded = rows.flat_map(|(seen, mirrored)| {
+            let pairs = seen.iter().zip(self.actions.image(mirrored));
+            pairs.map(|(a, b)| 0.5 * (a + b))
+        });
+        folded.collect()
+    }
+
+    /// The gradient of the answers that [`fold`](Self::fold) takes, from that of what it gives.
+    pub fn unfold(&self, gradient: &[f32]) -> Vec<f32> {
+        // The mirror is its own inverse, and its own transpose.
+        let mut both: Vec<f32> = gradient.iter().map(|g| 0.5 * g).collect();
+        let seen = both.clone();
+        self.actions.extend(&mut both, &seen);
+        both
+    }
+
+    /// As [`fold`](Self::fold), differentiable: 2N × actions to N × actions.
+    ///
+    /// # Errors
+    /// When `answers` has another width or an odd number of rows.
+    pub fn fold_tensor(&self, answers: &Tensor) -> candle_core::Result<Tensor> {
+        let rows = answers.dim(0)? / 2;
+        let seen = answers.narrow(0, 0, rows)?;
+        let mirrored = self.actions.forward(&answers.narrow(0, rows, rows)?)?;
+        (seen + mirrored)? * 0.5
     }
 }
 
@@ -75,6 +138,8 @@ pub struct Policy {
     robot: Arc<Robot>,
     config: PolicyConfig,
     normalizer: Normalizer,
+    /// Where the policy is symmetric.
+    mirror: Option<PolicyMirror>,
     network: Mlp,
     /// The network as it acts; `network` itself is what gradients go through.
     packed: PackedMlp,
@@ -155,10 +220,13 @@ impl Policy {
         let packed = network
             .pack()
             .map_err(|e| format!("the network's tensors: {e}"))?;
+        let mirror = PolicyMirror::new(&robot, &config)
+            .map_err(|e| format!("the policy is symmetric: {e}"))?;
         Ok(Self {
             robot,
             config,
             normalizer,
+            mirror,
             network,
             packed,
             metadata,
@@ -225,10 +293,17 @@ impl Policy {
     /// # Errors
     /// When the number of features is no multiple of [`PolicyConfig::features`].
     pub fn actions_from_features(&self, mut features: Vec<f32>) -> Result<Vec<f32>, ModelError> {
+        if let Some(mirror) = &self.mirror {
+            let rows = features.clone();
+            mirror.features.extend(&mut features, &rows);
+        }
         self.normalizer.apply(&mut features);
-        let mut actions = Vec::new();
-        Scratch::with(|scratch| self.packed.forward(&features, &mut actions, scratch))?;
-        Ok(actions)
+        let mut answers = Vec::new();
+        Scratch::with(|scratch| self.packed.forward(&features, &mut answers, scratch))?;
+        Ok(match &self.mirror {
+            Some(mirror) => mirror.fold(&answers),
+            None => answers,
+        })
     }
 
     /// The actions (N × leg joints, policy units) for stacks (N × [`ObservationLayout::width`]).
@@ -246,7 +321,12 @@ impl Policy {
     pub fn forward(&self, stacks: &Tensor) -> candle_core::Result<Tensor> {
         let config = &self.config;
         let features = config.history_map.project(&config.observation, stacks)?;
-        self.network.forward(&self.normalizer.forward(&features)?)
+        let answers = |features: &Tensor| self.network.forward(&self.normalizer.forward(features)?);
+        let Some(mirror) = &self.mirror else {
+            return answers(&features);
+        };
+        let both = Tensor::cat(&[&features, &mirror.features.forward(&features)?], 0)?;
+        mirror.fold_tensor(&answers(&both)?)
     }
 
     /// Leg targets (rad, inside the joints' ranges) of one action: default + scale · action.
@@ -330,6 +410,60 @@ mod tests {
         assert_eq!(received.actions(&stacks).unwrap(), batch);
         let error = Policy::decode(&sent[..100], "sent".as_ref(), self::robot());
         assert!(error.unwrap_err().to_string().contains("sent"));
+    }
+
+    #[test]
+    fn the_mirrored_observation_gets_the_mirrored_action_to_the_bit() {
+        let (robot, folder) = (robot(), tempfile::tempdir().unwrap());
+        let path = folder.path().join("policy.safetensors");
+        let config = PolicyConfig::new(&robot, vec![32, 16]);
+        assert!(config.symmetric);
+        save(&path, &config, &robot);
+        let policy = Policy::load(&path, Arc::clone(&robot)).unwrap();
+        let frame = Mirror::frame(&robot, policy.layout()).unwrap();
+        let legs = Mirror::leg_joints(&robot.mirror().unwrap());
+        // Rows that are not alike, and rows of any size: what a batch has beside a row does not matter.
+        let mut state = 1_u64;
+        let mut number = || {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            (state >> 33) as f32 / (1_u64 << 30) as f32 - 1.0
+        };
+        let stacks: Vec<f32> = (0..7 * policy.layout().width()).map(|_| number()).collect();
+        let mirrored = frame.rows(&stacks);
+        let (actions, images) = (
+            policy.actions(&stacks).unwrap(),
+            policy.actions(&mirrored).unwrap(),
+        );
+        assert_eq!(legs.rows(&actions), images);
+        assert_ne!(actions, images);
+        assert!(actions.iter().any(|action| action.abs() > 1e-3));
+    }
+
+    #[test]
+    fn a_policy_that_says_nothing_of_symmetry_is_its_network() {
+        let (robot, folder) = (robot(), tempfile::tempdir().unwrap());
+        let path = folder.path().join("policy.safetensors");
+        let config = PolicyConfig {
+            symmetric: false,
+            ..PolicyConfig::new(&robot, vec![8])
+        };
+        save(&path, &config, &robot);
+        let mut written = serde_json::to_value(&config).unwrap();
+        written.as_object_mut().unwrap().remove("symmetric");
+        assert_eq!(
+            serde_json::from_value::<PolicyConfig>(written).unwrap(),
+            config
+        );
+        let policy = Policy::load(&path, robot).unwrap();
+        let stack: Vec<f32> = (0..policy.layout().width())
+            .map(|i| (i as f32).sin())
+            .collect();
+        let features = policy.features(&stack);
+        let mut expected = Vec::new();
+        Scratch::with(|scratch| policy.packed.forward(&features, &mut expected, scratch)).unwrap();
+        assert_eq!(policy.actions(&stack).unwrap(), expected);
     }
 
     #[test]

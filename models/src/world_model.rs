@@ -89,13 +89,7 @@ impl WorldModelConfig {
 
     /// Refuses a shape that does not fit `robot`.
     fn check(&self, robot: &Robot) -> Result<(), String> {
-        let expected = ObservationLayout::new(robot, self.observation.history());
-        if self.observation != expected {
-            return Err(format!(
-                "the observation is {:?}, expected {expected:?}",
-                self.observation
-            ));
-        }
+        self.observation.check(robot)?;
         self.history_map.check(&self.observation)
     }
 }

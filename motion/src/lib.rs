@@ -10,6 +10,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod arm_motion;
 pub mod atomic;
 pub mod bvh;
 pub mod c3d;

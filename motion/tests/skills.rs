@@ -51,10 +51,23 @@ fn every_frame_is_a_body_with_constant_bones() {
 
 #[test]
 fn hands_move_at_human_speed_and_smoothly() {
-    for clip in clips() {
-        let (speed, jerk) = (peak(&clip, 1), peak(&clip, 3));
-        assert!((0.1..5.0).contains(&speed), "{}: {speed} m/s", clip.name);
-        assert!(jerk < 2500.0, "{}: {jerk} m/s³", clip.name);
+    for skill in Skill::ALL {
+        // Blows and throws are as fast as people's, and as sudden.
+        let [most_speed, most_jerk] = if Skill::LIVELY.contains(&skill) {
+            [7.5, 12_000.0]
+        } else {
+            [5.0, 2500.0]
+        };
+        for seed in SEEDS {
+            let clip = generate(skill, seed);
+            let (speed, jerk) = (peak(&clip, 1), peak(&clip, 3));
+            assert!(
+                (0.1..most_speed).contains(&speed),
+                "{}: {speed} m/s",
+                clip.name
+            );
+            assert!(jerk < most_jerk, "{}: {jerk} m/s³", clip.name);
+        }
     }
 }
 
@@ -69,7 +82,7 @@ fn hands_turn_smoothly() {
                 ) {
                     // Through quaternions: the angle of two nearly equal matrices is NaN in single precision.
                     let turn = UnitQuaternion::from(a).angle_to(&UnitQuaternion::from(b)) * 50.0;
-                    assert!(turn < 25.0, "{}: {turn} rad/s", clip.name);
+                    assert!(turn < 35.0, "{}: {turn} rad/s", clip.name);
                 }
             }
         }
@@ -207,7 +220,7 @@ fn a_medley_is_half_a_minute_and_joins_smoothly() {
                 .iter()
                 .all(|f| f.wrist_rotations.iter().all(Option::is_some))
         );
-        assert!(peak(&clip, 3) < 2500.0);
+        assert!(peak(&clip, 3) < 5000.0);
     }
 }
 

@@ -36,6 +36,11 @@ impl JointMirror {
         &self.signs
     }
 
+    /// Number of goal joints.
+    pub fn goal_joints(&self) -> usize {
+        self.goal_joints
+    }
+
     /// Mirrors a vector over all joints, goal joints first.
     ///
     /// # Panics

@@ -82,6 +82,8 @@ pub struct Episode {
     pub length: u32,
     /// Why it ended.
     pub end: EndReason,
+    /// Index of the clip in the goal library that was played at its end.
+    pub clip: u32,
 }
 
 /// Environments that are explored with a policy.
@@ -121,6 +123,11 @@ impl Collector {
     /// How hard episodes are that start from now on; see [`VecEnvironment::set_curriculum`].
     pub fn set_curriculum(&mut self, randomization: f64, difficulty: f32) {
         self.environments.set_curriculum(randomization, difficulty);
+    }
+
+    /// How often each clip is drawn from now on; see [`VecEnvironment::set_clip_weights`].
+    pub fn set_clip_weights(&mut self, weights: &[f32]) {
+        self.environments.set_clip_weights(weights);
     }
 
     /// Runs the environments for `horizon` control periods. Actions are the policy's plus normal noise, whose standard
@@ -270,12 +277,11 @@ impl Rollout {
             }
         }
         let finals = step.final_privileged.chunks_exact(width);
-        for (n, ((&end, &length), privileged)) in
-            step.ends.iter().zip(step.lengths).zip(finals).enumerate()
-        {
+        let ended = step.ends.iter().zip(step.lengths).zip(step.clips);
+        for (n, (((&end, &length), &clip), privileged)) in ended.zip(finals).enumerate() {
             self.ends.push(End::from(end));
             let Some(end) = end else { continue };
-            self.statistics.episodes.push(Episode { length, end });
+            self.statistics.episodes.push(Episode { length, end, clip });
             if end == EndReason::TimedOut {
                 let row = t * self.environments + n;
                 self.timed_out_privileged.push((row, privileged.to_vec()));

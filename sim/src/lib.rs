@@ -40,6 +40,7 @@ mod pool;
 pub mod pushes;
 pub mod quantile;
 mod ranges;
+mod sensors;
 mod skeleton;
 pub mod suite;
 #[cfg(test)]
@@ -50,6 +51,9 @@ pub use collector::{Collector, End, Episode, Rollout, RolloutStatistics};
 pub use collision::SelfCollision;
 pub use divergence::Divergence;
 pub use error::SimError;
-pub use physics::{Body, BodyParameters, FootReading, Reading, SelfContact, Stage, Start, Targets};
+pub use physics::{
+    Body, BodyParameters, FootReading, Physics, Reading, SelfContact, Stage, Start, Targets,
+};
 pub use pool::{Pool, Priority};
+pub use sensors::SensorNoise;
 pub use skeleton::{Skeleton, SkeletonPose};

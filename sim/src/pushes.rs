@@ -14,12 +14,19 @@ use crate::ranges::within;
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Push {
+    /// Share of episodes that have pushes.
+    #[serde(default = "always")]
+    pub ratio: f64,
     /// Time between two pushes, seconds; the time of an episode's first is drawn.
     pub interval: f64,
     /// Largest change of the horizontal velocity on each axis, m/s.
     pub linear: f64,
     /// Largest change of the angular velocity about each axis, rad/s.
     pub angular: f64,
+}
+
+fn always() -> f64 {
+    1.0
 }
 
 impl Push {

@@ -10,7 +10,7 @@ use emp_sim::{
 };
 use emp_tests::{TestServer, emp27, process::ServerProcess, root, weights};
 use emp_training::policy::{
-    Settings, Trainer,
+    Preset, Settings, Trainer,
     remote::RemoteSource,
     source::{LocalSource, PolicySnapshot, RolloutSource},
 };
@@ -18,14 +18,14 @@ use emp_training::policy::{
 const HORIZON: usize = 24;
 
 /// Many short episodes.
-fn settings() -> Settings {
+fn settings(robot: &Robot) -> Settings {
     Settings {
         environments: 64,
         environment: EnvironmentConfig {
             episode_frames: 20,
-            ..EnvironmentConfig::default()
+            ..EnvironmentConfig::robust(robot)
         },
-        ..Settings::default()
+        ..Settings::preset(Preset::Robust, robot)
     }
 }
 
@@ -39,18 +39,24 @@ fn library(robot: &Robot) -> anyhow::Result<GoalLibrary> {
 }
 
 fn snapshot(robot: &Arc<Robot>) -> anyhow::Result<PolicySnapshot> {
-    let trainer = Trainer::new(Arc::clone(robot), settings(), 1)?;
+    let trainer = Trainer::new(
+        Arc::clone(robot),
+        settings(robot),
+        Arc::new(library(robot)?),
+        1,
+    )?;
     Ok(PolicySnapshot {
         policy: Arc::new(trainer.policy()?),
         log_std: vec![-1.0; robot.leg_joints().len()],
         randomization: 0.5,
         difficulty: 0.8,
+        clip_weights: vec![0.7],
     })
 }
 
 fn local(robot: &Arc<Robot>) -> anyhow::Result<LocalSource> {
     let pool = Arc::new(Pool::new(robot, 2, Priority::Normal)?);
-    LocalSource::new(robot, &pool, &settings(), Arc::new(library(robot)?))
+    LocalSource::new(robot, &pool, &settings(robot), Arc::new(library(robot)?))
 }
 
 fn collect(source: &mut dyn RolloutSource, snapshot: &PolicySnapshot) -> anyhow::Result<Rollout> {
@@ -87,7 +93,7 @@ fn two_server_processes_collect_what_this_one_would() -> anyhow::Result<()> {
     ];
     let urls = servers.each_ref().map(|server| server.url.clone());
     let mut here = local(&robot)?;
-    let mut there = RemoteSource::new(&urls, &robot, &settings(), &library(&robot)?)?;
+    let mut there = RemoteSource::new(&urls, &robot, &settings(robot), &library(&robot)?)?;
     for _ in 0..3 {
         let served = collect(&mut there, &snapshot)?;
         assert_same(&served, &collect(&mut here, &snapshot)?);
@@ -106,7 +112,7 @@ fn a_server_that_comes_back_goes_on_where_it_was() -> anyhow::Result<()> {
     let server = TestServer::start_real()?;
     let (port, urls) = (server.port(), [server.url()]);
     let mut here = local(&robot)?;
-    let mut there = RemoteSource::new(&urls, &robot, &settings(), &library(&robot)?)?;
+    let mut there = RemoteSource::new(&urls, &robot, &settings(robot), &library(&robot)?)?;
     let served = collect(&mut there, &snapshot)?;
     assert_same(&served, &collect(&mut here, &snapshot)?);
     server.kill();
@@ -125,7 +131,7 @@ fn a_server_that_comes_back_goes_on_where_it_was() -> anyhow::Result<()> {
 fn a_server_that_refuses_is_named() -> anyhow::Result<()> {
     let robot = emp27()?;
     let server = TestServer::start_real()?;
-    let mut wrong = settings();
+    let mut wrong = settings(&robot);
     wrong.environment.tilt_limit = 2.0;
     let source = RemoteSource::new(&[server.url()], &robot, &wrong, &library(&robot)?);
     let error = format!("{:#}", source.err().expect("a refusal"));

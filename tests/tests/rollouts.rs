@@ -569,6 +569,7 @@ fn collect_request(policy: &Policy, iteration: u64) -> anyhow::Result<CollectReq
         horizon: 24,
         randomization: 0.5,
         difficulty: 0.8,
+        clip_weights: vec![0.5, 2.0],
     })
 }
 
@@ -749,6 +750,13 @@ async fn wrong_rollouts_are_refused_by_field() -> anyhow::Result<()> {
             "collect.difficulty",
             CollectRequest {
                 difficulty: f64::NAN,
+                ..good.clone()
+            },
+        ),
+        (
+            "collect.clip_weights[1]",
+            CollectRequest {
+                clip_weights: vec![1.0, 0.0],
                 ..good
             },
         ),

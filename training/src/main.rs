@@ -66,6 +66,8 @@ enum Command {
     FallReport(commands::fall_report::Arguments),
     /// Compare a trained retargeter with converged inverse kinematics on the same objective.
     RetargetReport(commands::retarget_report::Arguments),
+    /// Measure how lively procedural skills and recorded motion are, beside people.
+    SkillReport(commands::skill_report::Arguments),
 }
 
 fn main() -> Result<ExitCode> {
@@ -83,6 +85,7 @@ fn main() -> Result<ExitCode> {
         Command::EmpReport(arguments) => commands::emp_report::run(&arguments),
         Command::FallReport(arguments) => commands::fall_report::run(&arguments),
         Command::RetargetReport(arguments) => commands::retarget_report::run(&arguments),
+        Command::SkillReport(arguments) => commands::skill_report::run(&arguments),
     }
 }
 

@@ -93,13 +93,7 @@ impl EmpConfig {
 
     /// Refuses a shape that does not fit `robot`.
     pub(super) fn check(&self, robot: &Robot) -> Result<(), String> {
-        let expected = ObservationLayout::new(robot, self.observation.history());
-        if self.observation != expected {
-            return Err(format!(
-                "the observation is {:?}, expected {expected:?}",
-                self.observation
-            ));
-        }
+        self.observation.check(robot)?;
         let (DangerGate::Regloss(gate) | DangerGate::Tilt(gate)) = self.gate;
         if !gate.is_finite() || gate < 0.0 {
             return Err(format!("the gate is {gate}, expected a number from 0"));

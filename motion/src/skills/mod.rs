@@ -4,6 +4,8 @@
 //! second, begin and end with hanging arms, and keep elbows and wrists out of the person's own trunk.
 
 mod body;
+mod lively;
+mod performance;
 mod scripts;
 mod skill;
 mod timeline;
@@ -18,7 +20,7 @@ pub use skill::Skill;
 
 use crate::{Clip, KeyNodeFrame, Side};
 use body::{Body, Pose};
-use scripts::Performance;
+use performance::Performance;
 use timeline::{FPS, Timeline};
 
 /// Share of clips without wrist orientations, as in many recordings.
@@ -52,19 +54,19 @@ pub fn generate(skill: Skill, seed: u64) -> Clip {
     clip
 }
 
-/// Every skill once, briefly, by one person, about 30 to 40 s.
+/// Every skill of [`Skill::MEDLEY`] once, briefly, by one person, about 30 to 40 s.
 #[must_use]
 pub fn medley(seed: u64) -> Clip {
     medley_with_starts(seed).0
 }
 
-/// The medley, and the frame at which each skill of [`Skill::ALL`] begins.
+/// The medley, and the frame at which each skill of [`Skill::MEDLEY`] begins.
 #[must_use]
 pub fn medley_with_starts(seed: u64) -> (Clip, Vec<usize>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let body = Body::random(&mut rng);
     let mut time = Timeline::new(&body);
-    let starts = Skill::ALL
+    let starts = Skill::MEDLEY
         .into_iter()
         .map(|skill| {
             let start = time.poses.len();
@@ -79,17 +81,19 @@ pub fn medley_with_starts(seed: u64) -> (Clip, Vec<usize>) {
     )
 }
 
-/// A varied set of clips: two thirds go through the skills in turn, one third are random reaches.
+/// A varied set of clips: half of them go through the lively skills in turn, a quarter through the everyday ones of a
+/// medley, and a quarter are random reaches.
 #[must_use]
 pub fn library(seed: u64, clips: usize) -> Vec<Clip> {
     let mut seeds = ChaCha8Rng::seed_from_u64(seed);
-    let mut skills = Skill::ALL.into_iter().cycle();
+    let mut lively = Skill::LIVELY.into_iter().cycle();
+    let mut everyday = Skill::MEDLEY.into_iter().cycle();
     (0..clips)
         .map(|index| {
-            let skill = if index % 3 == 2 {
-                Some(Skill::RandomReaches)
-            } else {
-                skills.next()
+            let skill = match index % 4 {
+                0 | 2 => lively.next(),
+                1 => everyday.next(),
+                _ => None,
             };
             generate(skill.unwrap_or(Skill::RandomReaches), seeds.random())
         })
@@ -161,7 +165,7 @@ mod tests {
         for seed in 0..20 {
             let (clip, starts) = medley_with_starts(seed);
             let ends = starts[1..].iter().copied().chain([clip.frames.len()]);
-            for ((skill, start), end) in Skill::ALL.iter().zip(&starts).zip(ends) {
+            for ((skill, start), end) in Skill::MEDLEY.iter().zip(&starts).zip(ends) {
                 let shown = &clip.frames[*start..end];
                 assert!(
                     shown.len() > 25,
@@ -202,12 +206,16 @@ mod tests {
                 let body = Body::random(&mut rng);
                 let mut time = Timeline::new(&body);
                 append(&mut time, &body, skill, seed % 2 == 0, &mut rng);
-                assert!(
-                    time.poses
-                        .iter()
-                        .all(|pose| body.is_clear(&body.frame(pose))),
-                    "{} {seed}",
-                    skill.name()
+                let blocked = time
+                    .poses
+                    .iter()
+                    .position(|pose| !body.is_clear(&body.frame(pose)));
+                assert_eq!(
+                    blocked,
+                    None,
+                    "{} {seed}: {:?}",
+                    skill.name(),
+                    blocked.map(|frame| time.poses[frame])
                 );
             }
         }

@@ -8,58 +8,12 @@ use nalgebra::Vector3;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::body::{ArmPose, Body, Pose};
+use super::body::{ArmPose, Pose};
+use super::lively;
+use super::performance::Performance;
 use super::skill::Skill;
 use super::timeline::Timeline;
 use crate::Side;
-
-/// How a skill is performed this time.
-pub(super) struct Performance<'a> {
-    pub(super) body: &'a Body,
-    /// The arms in use.
-    pub(super) sides: Vec<Side>,
-    /// Speed, 1 being usual.
-    pub(super) tempo: f64,
-    /// Shortest recognisable form, for a medley.
-    pub(super) brief: bool,
-}
-
-impl Performance<'_> {
-    /// The arm of a one-armed skill.
-    fn side(&self) -> Side {
-        self.sides.first().copied().unwrap_or(Side::Right)
-    }
-
-    fn repeats(&self, rng: &mut ChaCha8Rng, most: usize) -> usize {
-        if self.brief {
-            1
-        } else {
-            rng.random_range(2..=most)
-        }
-    }
-
-    /// Length of a cyclic part of `cycles` periods (fewer when brief) at `hertz`, and the rate at this tempo.
-    fn cycles(
-        &self,
-        rng: &mut ChaCha8Rng,
-        brief: f64,
-        usual: std::ops::Range<f64>,
-        hertz: f64,
-    ) -> (f64, f64) {
-        let rate = hertz * self.tempo;
-        let cycles = if self.brief {
-            brief
-        } else {
-            rng.random_range(usual)
-        };
-        (cycles / rate, rate)
-    }
-
-    /// +1 where the trunk turns left to bring this arm forward, −1 where right.
-    fn turn(&self) -> f64 {
-        if self.side() == Side::Left { -1.0 } else { 1.0 }
-    }
-}
 
 /// Appends a skill to the timeline. It begins at the timeline's current pose and ends in a pose of its own.
 pub(super) fn perform(skill: Skill, time: &mut Timeline, how: &Performance, rng: &mut ChaCha8Rng) {
@@ -81,6 +35,19 @@ pub(super) fn perform(skill: Skill, time: &mut Timeline, how: &Performance, rng:
         Skill::ArmCircles => arm_circles(time, how, rng),
         Skill::Idle => idle(time, how, rng),
         Skill::RandomReaches => random_reaches(time, how, rng),
+        Skill::RaiseHands => lively::raise_hands(time, how, rng),
+        Skill::GoodBye => lively::good_bye(time, how, rng),
+        Skill::Box => lively::box_combination(time, how, rng),
+        Skill::Throw => lively::throw(time, how, rng),
+        Skill::Drum => lively::drum(time, how, rng),
+        Skill::Conduct => lively::conduct(time, how, rng),
+        Skill::Chop => lively::chop(time, how, rng),
+        Skill::Swim => lively::swim(time, how, rng),
+        Skill::Dance => lively::dance(time, how, rng),
+        Skill::JumpingJack => lively::jumping_jack(time, how, rng),
+        Skill::Guide => lively::guide(time, how, rng),
+        Skill::CrossArms => lively::cross_arms(time, how, rng),
+        Skill::HandsOnHips => lively::hands_on_hips(time, how, rng),
     }
 }
 
@@ -141,8 +108,10 @@ fn wave(time: &mut Timeline, how: &Performance, rng: &mut ChaCha8Rng) {
         .swivel(rng.random_range(0.2..0.5))
         .turned(0.3, -0.1, 0.0);
     time.move_to(Pose::rest().with_arms(&how.sides, raised), 1.8 * how.tempo);
-    let swing = rng.random_range(0.16..0.26);
-    let (seconds, rate) = how.cycles(rng, 2.5, 4.0..8.0, 1.5);
+    // From leisurely and wide to quick, 0.8 to 2.5 times a second.
+    let swing = rng.random_range(0.16..0.5);
+    let hertz = rng.random_range(0.85..2.3);
+    let (seconds, rate) = how.cycles(rng, 2.5, 4.0..8.0, hertz);
     time.cycle(seconds, |t, strength, pose| {
         let wave = strength * (TAU * rate * t).sin();
         for side in &how.sides {
@@ -258,7 +227,8 @@ fn clap(time: &mut Timeline, how: &Performance, rng: &mut ChaCha8Rng) {
         1.3 * how.tempo,
     );
     let opening = rng.random_range(0.2..0.32);
-    let (seconds, rate) = how.cycles(rng, 3.0, 5.0..10.0, 1.8);
+    let hertz = rng.random_range(1.4..3.0);
+    let (seconds, rate) = how.cycles(rng, 3.0, 5.0..10.0, hertz);
     time.cycle(seconds, |t, strength, pose| {
         let open = 0.5 * strength * (1.0 - (TAU * rate * t).cos());
         for arm in &mut pose.arms {

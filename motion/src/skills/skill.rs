@@ -37,11 +37,37 @@ pub enum Skill {
     Idle,
     /// Reaching to random places all over the reachable space.
     RandomReaches,
+    /// Throwing one hand or both overhead.
+    RaiseHands,
+    /// Good-bye, with one hand or both.
+    GoodBye,
+    /// Boxing: combinations of punches.
+    Box,
+    /// Throwing a ball.
+    Throw,
+    /// Drumming.
+    Drum,
+    /// Conducting an orchestra.
+    Conduct,
+    /// Chopping wood.
+    Chop,
+    /// The arms of a swimmer.
+    Swim,
+    /// The arms of a dancer.
+    Dance,
+    /// The arms of jumping jacks.
+    JumpingJack,
+    /// Showing the way and pointing.
+    Guide,
+    /// Arms folded in front of the chest.
+    CrossArms,
+    /// Hands on the hips.
+    HandsOnHips,
 }
 
 impl Skill {
-    /// All skills, in the order of a medley.
-    pub const ALL: [Self; 17] = [
+    /// The skills of a medley: an everyday tour, in this order.
+    pub const MEDLEY: [Self; 17] = [
         Self::Idle,
         Self::Wave,
         Self::ReachFront,
@@ -59,6 +85,59 @@ impl Skill {
         Self::ReachLow,
         Self::ArmCircles,
         Self::RandomReaches,
+    ];
+
+    /// All skills.
+    pub const ALL: [Self; 30] = [
+        Self::Idle,
+        Self::Wave,
+        Self::ReachFront,
+        Self::Hammer,
+        Self::RaiseHands,
+        Self::Drink,
+        Self::Box,
+        Self::ReachOverhead,
+        Self::ScrewLightBulb,
+        Self::Throw,
+        Self::Clap,
+        Self::Drum,
+        Self::Punch,
+        Self::GoodBye,
+        Self::ReachSide,
+        Self::Conduct,
+        Self::WipeWindow,
+        Self::Dance,
+        Self::LiftBox,
+        Self::Swim,
+        Self::CombHair,
+        Self::JumpingJack,
+        Self::DirectTraffic,
+        Self::Guide,
+        Self::ReachLow,
+        Self::Chop,
+        Self::ArmCircles,
+        Self::CrossArms,
+        Self::RandomReaches,
+        Self::HandsOnHips,
+    ];
+
+    /// The skills of lively people: half of a library.
+    pub const LIVELY: [Self; 15] = [
+        Self::Wave,
+        Self::Box,
+        Self::RaiseHands,
+        Self::Throw,
+        Self::Dance,
+        Self::Drum,
+        Self::JumpingJack,
+        Self::GoodBye,
+        Self::Chop,
+        Self::Conduct,
+        Self::Swim,
+        Self::Clap,
+        Self::Guide,
+        Self::CrossArms,
+        Self::HandsOnHips,
     ];
 
     /// The skill's name in clips and on the command line.
@@ -82,6 +161,19 @@ impl Skill {
             Self::ArmCircles => "arm-circles",
             Self::Idle => "idle",
             Self::RandomReaches => "random-reaches",
+            Self::RaiseHands => "raise-hands",
+            Self::GoodBye => "good-bye",
+            Self::Box => "box",
+            Self::Throw => "throw",
+            Self::Drum => "drum",
+            Self::Conduct => "conduct",
+            Self::Chop => "chop",
+            Self::Swim => "swim",
+            Self::Dance => "dance",
+            Self::JumpingJack => "jumping-jack",
+            Self::Guide => "guide",
+            Self::CrossArms => "cross-arms",
+            Self::HandsOnHips => "hands-on-hips",
         }
     }
 
@@ -97,6 +189,9 @@ impl Skill {
                 | Self::ReachLow
                 | Self::ArmCircles
                 | Self::RandomReaches
+                | Self::RaiseHands
+                | Self::GoodBye
+                | Self::HandsOnHips
         )
     }
 }

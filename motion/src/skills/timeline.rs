@@ -7,8 +7,9 @@ use crate::{MINIMUM_JERK_PEAK, minimum_jerk};
 
 /// Frames a second of procedural clips.
 pub(super) const FPS: f64 = 50.0;
-/// No move is shorter, seconds.
+/// No move is shorter, and no strike, seconds.
 const SHORTEST_MOVE: f64 = 0.2;
+const SHORTEST_STRIKE: f64 = 0.14;
 /// Longest rise and fall of a cycle, seconds.
 const RAMP: f64 = 0.5;
 
@@ -39,11 +40,20 @@ impl Timeline {
 
     /// Moves to a pose so that the faster hand peaks at about `peak_speed`, m/s.
     pub(super) fn move_to(&mut self, to: Pose, peak_speed: f64) {
+        self.go(to, peak_speed, SHORTEST_MOVE);
+    }
+
+    /// As [`move_to`](Self::move_to), for blows: a short way may be over sooner.
+    pub(super) fn strike(&mut self, to: Pose, peak_speed: f64) {
+        self.go(to, peak_speed, SHORTEST_STRIKE);
+    }
+
+    fn go(&mut self, to: Pose, peak_speed: f64, shortest: f64) {
         let from = self.current();
         let path = |i: usize| path_length(&from.arms[i].hand, &to.arms[i].hand);
         let trunk = (to.yaw - from.yaw).abs().max((to.lean - from.lean).abs());
         let metres = (path(0).max(path(1)) + trunk) * self.arm_length;
-        let count = frames((MINIMUM_JERK_PEAK * metres / peak_speed).max(SHORTEST_MOVE));
+        let count = frames((MINIMUM_JERK_PEAK * metres / peak_speed).max(shortest));
         self.poses.extend(
             (1..=count).map(|i| between(&from, &to, minimum_jerk(i as f64 / count as f64))),
         );

@@ -101,6 +101,7 @@ pub(super) fn episodes(statistics: &RolloutStatistics) -> Vec<TrainingEpisode> {
         .map(|episode| TrainingEpisode {
             length: episode.length,
             end: training_end(episode.end).into(),
+            clip: episode.clip,
         })
         .collect()
 }

@@ -36,6 +36,8 @@ const MAX_ROWS: u64 = 262_144;
 const MAX_CLIPS: u32 = 1_000_000;
 /// Largest scale of randomisation and goals.
 const MAX_SCALE: f64 = 10.0;
+/// Most often that a clip may be drawn, relative to the others.
+const MAX_CLIP_WEIGHT: f32 = 1000.0;
 /// Most bytes of a snapshot.
 const MAX_SNAPSHOT: usize = 1 << 30;
 /// Bytes of a snapshot in one message.
@@ -288,6 +290,7 @@ impl Learner<'_> {
             horizon,
             randomization,
             difficulty,
+            clip_weights,
         } = request;
         let environments = self.collector.environments().len() as u64;
         let longest = u32::try_from(MAX_ROWS / environments).unwrap_or(u32::MAX);
@@ -299,8 +302,13 @@ impl Learner<'_> {
         crate::check::numbers(field, log_standard_deviation, legs, "numbers")?;
         let policy = Policy::decode(policy, Path::new("collect.policy"), Arc::clone(&self.robot))
             .map_err(|error| FieldError::new("collect.policy", error.to_string()))?;
+        for (index, weight) in clip_weights.iter().enumerate() {
+            let field = format!("collect.clip_weights[{index}]");
+            read::within(&field, *weight, f32::MIN_POSITIVE..=MAX_CLIP_WEIGHT)?;
+        }
         self.collector
             .set_curriculum(randomization, difficulty as f32);
+        self.collector.set_clip_weights(clip_weights);
         let rollout = self.run(&policy, log_standard_deviation, horizon)?;
         for block in blocks::of(&rollout, *iteration) {
             self.send(Response::Block(block))?;

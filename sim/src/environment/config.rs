@@ -5,7 +5,7 @@ use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
 use super::{EndReason, Randomization, RewardWeights};
-use crate::{Reading, SimError};
+use crate::{Physics, Reading, SimError};
 
 /// Settings of the training environments. The default is the paper's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,6 +21,11 @@ pub struct EnvironmentConfig {
     pub tilt_limit: f64,
     /// An episode ends when the base is lower than this share of its standing height.
     pub height_limit: f64,
+    /// Control periods in which the heading, to which the observed yaw is relative, comes near the base's; 0: it stays as
+    /// at the episode's start.
+    pub heading_periods: u32,
+    /// How exactly the robots are simulated.
+    pub physics: Physics,
 }
 
 impl Default for EnvironmentConfig {
@@ -31,11 +36,26 @@ impl Default for EnvironmentConfig {
             episode_frames: 500,
             tilt_limit: 0.7,
             height_limit: 1.0 / 3.0,
+            heading_periods: 0,
+            physics: Physics::Exact,
         }
     }
 }
 
+/// Time constant of the robust policies' heading, control periods: ten seconds.
+const HEADING_PERIODS: u32 = 500;
+
 impl EnvironmentConfig {
+    /// For a robot that may step, with sensors as they are: harder pushes, heavier hands, noise and a yaw that drifts.
+    pub fn robust(robot: &Robot) -> Self {
+        Self {
+            randomization: Randomization::robust(robot),
+            rewards: RewardWeights::robust(),
+            heading_periods: HEADING_PERIODS,
+            ..Self::default()
+        }
+    }
+
     /// Refuses settings with which `robot` cannot be trained.
     ///
     /// # Errors

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use emp_models::observation::{HISTORY, ObservationLayout};
 use emp_robot::Robot;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -13,7 +14,7 @@ use super::subject::{EpisodeSetup, Kind, Subject};
 use super::{EnvironmentConfig, REWARD_TERMS, Randomization};
 use crate::goals::{GoalLibrary, GoalStream};
 use crate::pushes::Pushes;
-use crate::{Reading, Stage};
+use crate::{BodyParameters, Reading, Stage};
 
 /// What all environments share.
 #[derive(Debug)]
@@ -33,8 +34,10 @@ impl Setting {
         config: EnvironmentConfig,
         library: Arc<GoalLibrary>,
     ) -> Self {
+        let observation =
+            ObservationLayout::new(&robot, HISTORY).with_heading_periods(config.heading_periods);
         Self {
-            kind: Kind::new(robot),
+            kind: Kind::new(robot, observation),
             randomization: config.randomization,
             difficulty: 1.0,
             config,
@@ -58,6 +61,7 @@ pub(super) struct Slots<'a> {
     pub(super) terms: &'a mut [f64],
     pub(super) end: &'a mut Option<EndReason>,
     pub(super) length: &'a mut u32,
+    pub(super) clip: &'a mut u32,
 }
 
 /// One robot in the middle of an episode.
@@ -101,15 +105,22 @@ impl Environment {
     fn reset(&mut self, setting: &Setting, stage: &mut Stage) {
         self.rng = ChaCha8Rng::seed_from_u64(self.seeds.next_u64());
         let ranges = &setting.randomization;
-        let parameters = setting.kind.draw(ranges, &mut self.rng);
+        let parameters = BodyParameters {
+            physics: setting.config.physics,
+            ..setting.kind.draw(ranges, &mut self.rng)
+        };
         self.goals = setting
             .library
             .stream(self.rng.next_u64(), setting.difficulty);
         self.next_goal(setting);
+        let pushed: f64 = self.rng.random();
         let setup = EpisodeSetup {
             parameters,
             ranges,
-            pushes: ranges.push.map(Pushes::Random),
+            pushes: ranges
+                .push
+                .filter(|push| pushed < push.ratio)
+                .map(Pushes::Random),
         };
         self.subject
             .place(&setting.kind, stage, setup, &mut self.rng);
@@ -139,9 +150,11 @@ impl Environment {
         self.left = self.left.saturating_sub(1);
         let time_out = (self.left == 0).then_some(EndReason::TimedOut);
         let end = setting.fall(self.subject.body.reading()).or(time_out);
-        self.judge(setting, action, slots);
+        let fell = matches!(end, Some(EndReason::Tilted | EndReason::Sank));
+        self.judge(setting, action, fell, slots);
         *slots.end = end;
         *slots.length = self.age;
+        *slots.clip = self.goals.clip() as u32;
         if !matches!(end, Some(EndReason::Diverged(_))) {
             self.subject.remember(action);
             self.next_goal(setting);
@@ -167,7 +180,7 @@ impl Environment {
     }
 
     /// Writes the reward of the control period that just ended: the weighted terms' sum times its length.
-    fn judge(&self, setting: &Setting, action: &[f32], slots: &mut Slots<'_>) {
+    fn judge(&self, setting: &Setting, action: &[f32], fell: bool, slots: &mut Slots<'_>) {
         let (kind, reading) = (&setting.kind, self.subject.body.reading());
         let [last, before] = &self.subject.actions;
         let mut terms = [0.0; REWARD_TERMS];
@@ -178,6 +191,7 @@ impl Environment {
                 leg_default: &kind.leg_default,
                 action_scale: kind.robot.action_scale(),
                 actions: [action, last, before],
+                fell,
             });
         }
         *slots.reward = (terms.iter().sum::<f64>() / kind.robot.control_rate_hz()) as f32;

@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
+use emp_models::Mirror;
 use emp_models::observation::{ObservationLayout, projected_gravity, roll_pitch_yaw};
-use emp_robot::Robot;
+use emp_robot::{Robot, RobotError};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -98,6 +99,48 @@ impl PrivilegedLayout {
             motor_torque: next(legs),
             motor_damping: next(legs),
         }
+    }
+
+    /// The mirror of privileged observations of `robot`, whose observations have this layout.
+    ///
+    /// # Errors
+    /// When the robot has no mirror image.
+    pub fn mirror(
+        &self,
+        robot: &Robot,
+        observation: &ObservationLayout,
+    ) -> Result<Mirror, RobotError> {
+        let joints = robot.mirror()?;
+        let (all, goals, legs) = (
+            Mirror::joints(&joints),
+            Mirror::goal_joints(&joints),
+            Mirror::leg_joints(&joints),
+        );
+        // Rotations turn the other way about x and z, ways about y.
+        let (polar, axial) = ([1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]);
+        let factors = legs.clone().unsigned();
+        let mirror = Mirror::chain([
+            Mirror::frame(robot, observation)?,
+            Mirror::signs(&polar),
+            Mirror::signs(&axial),
+            all,
+            Mirror::signs(&[1.0]),
+            Mirror::signs(&polar),
+            Mirror::sides(),
+            Mirror::signs(&polar[..2]),
+            legs,
+            goals.clone(),
+            goals,
+            Mirror::signs(&[1.0]),
+            Mirror::signs(&[1.0]),
+            Mirror::sides(),
+            Mirror::signs(&[1.0]),
+            Mirror::signs(&polar),
+            Mirror::signs(&[1.0]),
+            factors.repeated(4),
+        ]);
+        debug_assert_eq!(mirror.width(), self.width());
+        Ok(mirror)
     }
 
     /// Numbers in a privileged observation.

@@ -1,4 +1,4 @@
-//! Domain randomisation (paper, table "Domain Randomization").
+//! Domain randomisation (paper, table "Domain Randomization"), and the noise of sensors beside it.
 
 use emp_robot::Robot;
 use rand::Rng;
@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::pushes::Push;
 use crate::ranges::{check_range, within};
-use crate::{BodyParameters, SimError};
+use crate::sensors::SensorNoise;
+use crate::{BodyParameters, Physics, SimError};
 
 /// A range of masses to add.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -76,6 +77,8 @@ pub struct Randomization {
     pub initial_joints: Option<[f64; 2]>,
     /// Factor on each action, drawn anew in every control period.
     pub action: Option<[f64; 2]>,
+    /// What sensors add to what they measure; not in the paper's table.
+    pub sensors: Option<SensorNoise>,
 }
 
 impl Default for Randomization {
@@ -94,6 +97,7 @@ impl Default for Randomization {
             motor_damping: Some([0.3, 4.0]),
             motor_delay: Some([0.0, 0.01]),
             push: Some(Push {
+                ratio: 1.0,
                 interval: 5.0,
                 linear: 0.5,
                 angular: 0.4,
@@ -104,9 +108,19 @@ impl Default for Randomization {
             }),
             initial_joints: Some([-0.1, 0.1]),
             action: Some([0.98, 1.02]),
+            sensors: None,
         }
     }
 }
+
+/// The robust preset: largest load of a hand, as a multiple of the paper's (3 kg for 60 kg of robot), and its pushes.
+const ROBUST_LOAD: f64 = 1.2;
+const ROBUST_PUSH: Push = Push {
+    ratio: 0.6,
+    interval: 1.5,
+    linear: 0.8,
+    angular: 0.5,
+};
 
 impl Randomization {
     /// Nothing differs from the robot's files.
@@ -127,11 +141,23 @@ impl Randomization {
             hang: None,
             initial_joints: None,
             action: None,
+            sensors: None,
+        }
+    }
+
+    /// The paper's table with heavier hands, harder and more frequent pushes in most episodes, and the noise of sensors.
+    pub fn robust(robot: &Robot) -> Self {
+        let heaviest = ROBUST_LOAD * robot.added_masses().hand[1];
+        Self {
+            hand_mass: MassRange::Kilograms([0.0, heaviest]),
+            push: Some(ROBUST_PUSH),
+            sensors: Some(SensorNoise::default()),
+            ..Self::default()
         }
     }
 
     /// The same rows, each range shrunk by `scale` about its nominal value: 1 leaves them, 0 is nominal. The interval of
-    /// pushes and the height of hanging stay.
+    /// pushes and how many episodes have them stay, and so does the height of hanging.
     #[must_use]
     pub fn scaled(&self, robot: &Robot, scale: f64) -> Self {
         let about = |nominal: f64| {
@@ -166,6 +192,7 @@ impl Randomization {
             }),
             initial_joints: self.initial_joints.map(added),
             action: self.action.map(factor),
+            sensors: self.sensors.map(|noise| noise.scaled(scale)),
         }
     }
 
@@ -197,6 +224,7 @@ impl Randomization {
             motor_torque,
             motor_damping,
             motor_delay: within(self.motor_delay, 0.0, rng),
+            physics: Physics::Exact,
         }
     }
 
@@ -233,6 +261,12 @@ impl Randomization {
             ("initial_joints", self.initial_joints, least, most),
             ("action", self.action, least, most),
             (
+                "push.ratio",
+                self.push.map(|push| [push.ratio; 2]),
+                0.0,
+                1.0,
+            ),
+            (
                 "push.interval",
                 self.push.map(|push| [push.interval; 2]),
                 period,
@@ -268,7 +302,7 @@ impl Randomization {
                 check_range(&format!("randomization.{name}"), range, least, most)?;
             }
         }
-        Ok(())
+        self.sensors.map_or(Ok(()), |noise| noise.check())
     }
 }
 

@@ -1,4 +1,4 @@
-//! Rewards (paper, table "Rewards Expressions and Weights").
+//! Rewards (paper, table "Rewards Expressions and Weights"), and two terms beside them for a robot that may step.
 
 use emp_models::observation::{projected_gravity, roll_pitch_yaw};
 use nalgebra::Vector2;
@@ -82,6 +82,23 @@ rewards! {
     joint_velocity = -1e-4,
     /// `‖q̈‖₂²` of the legs
     joint_acceleration = -1e-7,
+    /// `1(F_z ≥ 5 N)` of any foot: a foot may be lifted; not the paper's
+    any_foot_contact = 0.0,
+    /// 1 in the control period in which the robot fell; not the paper's
+    fall = 0.0,
+}
+
+impl RewardWeights {
+    /// For a robot that may step: one foot on the floor is as good as two, and a fall has its price, about a third of what a
+    /// robot that stands earns within the horizon of learning.
+    pub fn robust() -> Self {
+        Self {
+            feet_contact: 0.0,
+            any_foot_contact: 0.5,
+            fall: -250.0,
+            ..Self::default()
+        }
+    }
 }
 
 /// What a control period is judged by.
@@ -96,6 +113,8 @@ pub(super) struct Outcome<'a> {
     pub(super) action_scale: f64,
     /// The last actions, newest first: `a_t`, `a_{t−1}`, `a_{t−2}`, policy units.
     pub(super) actions: [&'a [f32]; 3],
+    /// Whether the robot fell in it.
+    pub(super) fell: bool,
 }
 
 impl RewardWeights {
@@ -136,7 +155,10 @@ impl Outcome<'_> {
             base_acceleration: (-3.0 * reading.velocity_change.norm()).exp(),
             leg_position: (-100.0 * leg_offset.sum::<f64>().sqrt()).exp(),
             feet_contact: standing.clone().count() as f64 / reading.feet.len() as f64,
-            feet_slip: standing.map(|foot| foot.velocity.norm().sqrt()).sum(),
+            feet_slip: standing
+                .clone()
+                .map(|foot| foot.velocity.norm().sqrt())
+                .sum(),
             action_range: joints.clone().map(|j| action(0, j).abs()).sum(),
             action_rate: joints
                 .clone()
@@ -148,6 +170,8 @@ impl Outcome<'_> {
             torques: square_norm(&reading.torques[goals..]),
             joint_velocity: square_norm(&reading.joint_velocities[goals..]),
             joint_acceleration: square_norm(&reading.joint_accelerations[goals..]),
+            any_foot_contact: f64::from(u8::from(standing.clone().next().is_some())),
+            fall: f64::from(u8::from(self.fell)),
         }
     }
 }

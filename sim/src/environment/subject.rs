@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use emp_models::observation::{HISTORY, History, ObservationLayout, RobotState};
+use emp_models::observation::{History, ObservationLayout, RobotState};
 use emp_robot::Robot;
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
@@ -12,6 +12,7 @@ use super::randomization::leg_targets;
 use super::{PrivilegedLayout, Randomization};
 use crate::pushes::{PushClock, Pushes};
 use crate::ranges::within;
+use crate::sensors::Sensors;
 use crate::{Body, BodyParameters, Stage, Start, Targets};
 
 /// Acceleration of gravity that turns the robot's mass into its weight, m/s².
@@ -32,8 +33,8 @@ pub(crate) struct Kind {
 }
 
 impl Kind {
-    pub(crate) fn new(robot: Arc<Robot>) -> Self {
-        let observation = ObservationLayout::new(&robot, HISTORY);
+    /// Robots whose observations have this layout.
+    pub(crate) fn new(robot: Arc<Robot>, observation: ObservationLayout) -> Self {
         Self {
             privileged: PrivilegedLayout::new(&observation),
             observation,
@@ -112,6 +113,8 @@ pub(crate) struct Subject {
     pushes: PushClock,
     /// Factor on each action, drawn anew in every control period.
     action_noise: Option<[f64; 2]>,
+    /// What it sees itself with; none: the truth.
+    sensors: Option<Sensors>,
     /// What the critic is told of the parameters.
     parameters: Vec<f32>,
 }
@@ -134,6 +137,7 @@ impl Subject {
             actions: [action.clone(), action],
             pushes: PushClock::default(),
             action_noise: None,
+            sensors: None,
             parameters: vec![0.0; kind.privileged.parameters().len()],
         }
     }
@@ -146,7 +150,13 @@ impl Subject {
         setup: EpisodeSetup<'_>,
         rng: &mut impl Rng,
     ) {
-        self.action_noise = setup.ranges.action;
+        let ranges = setup.ranges;
+        self.action_noise = ranges.action;
+        self.sensors = ranges.sensors.map(|noise| {
+            let period = 1.0 / kind.robot.control_rate_hz();
+            let joints = kind.observation.joint_positions().len();
+            Sensors::new(noise, joints, period, rng.random())
+        });
         (self.body, self.pushes) = kind.begin(stage, &self.goal, setup, rng);
         kind.privileged.write_parameters(
             &kind.robot,
@@ -194,11 +204,23 @@ impl Subject {
     /// Adds the present frame to the history.
     pub(crate) fn observe(&mut self) {
         let reading = self.body.reading();
-        let state = RobotState {
-            joint_positions: &reading.joint_positions,
-            orientation: reading.orientation,
-        };
-        self.history.push(&state, &self.goal);
+        match &mut self.sensors {
+            Some(sensors) => {
+                let (joint_positions, orientation) = sensors.measure(reading);
+                let state = RobotState {
+                    joint_positions: &joint_positions,
+                    orientation,
+                };
+                self.history.push(&state, &self.goal);
+            }
+            None => {
+                let state = RobotState {
+                    joint_positions: &reading.joint_positions,
+                    orientation: reading.orientation,
+                };
+                self.history.push(&state, &self.goal);
+            }
+        }
     }
 
     /// Writes what the critic sees now.

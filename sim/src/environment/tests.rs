@@ -11,7 +11,7 @@ use super::rewards::Outcome;
 use super::*;
 use crate::pushes::Push;
 use crate::testing::{emp27, for_each_robot, goal_library};
-use crate::{BodyParameters, Divergence, FootReading, Pool, Priority, Reading};
+use crate::{BodyParameters, Divergence, FootReading, Pool, Priority, Reading, Stage};
 
 fn environments(config: EnvironmentConfig, count: u64, threads: usize) -> VecEnvironment {
     let robot = emp27();
@@ -65,6 +65,7 @@ fn terms(robot: &Robot, reading: &Reading, actions: [&[f32]; 3]) -> impl Fn(&str
         leg_default: &legs,
         action_scale: robot.action_scale(),
         actions,
+        fell: false,
     });
     move |name| terms[REWARD_NAMES.iter().position(|&n| n == name).unwrap()]
 }
@@ -671,6 +672,7 @@ fn pushes_come_at_their_interval_at_any_phase() {
     let config = EnvironmentConfig {
         randomization: Randomization {
             push: Some(Push {
+                ratio: 1.0,
                 interval: 0.2,
                 linear: 3.0,
                 angular: 0.0,
@@ -776,4 +778,166 @@ fn action_noise_scales_the_offset_from_the_default_pose() {
         });
         assert_eq!(a, b);
     }
+}
+
+#[test]
+fn a_robot_that_falls_pays_for_it_once_and_any_foot_will_do() {
+    for_each_robot(|robot| {
+        let mut reading = still(robot);
+        reading.feet[1].force = 0.0;
+        let zero = [0.0_f32; 12];
+        let legs: Vec<f32> = robot
+            .leg_joints()
+            .iter()
+            .map(|joint| joint.default as f32)
+            .collect();
+        let terms = |rewards: RewardWeights, fell: bool| {
+            rewards.terms(&Outcome {
+                reading: &reading,
+                standing_height: robot.standing_height(),
+                leg_default: &legs,
+                action_scale: robot.action_scale(),
+                actions: [&zero, &zero, &zero],
+                fell,
+            })
+        };
+        let place = |name: &str| REWARD_NAMES.iter().position(|&n| n == name).unwrap();
+        let (paper, robust) = (RewardWeights::default(), RewardWeights::robust());
+        assert_eq!(terms(paper, true)[place("fall")], 0.0);
+        assert_eq!(terms(paper, false)[place("feet_contact")], 0.25);
+        assert_eq!(terms(robust, false)[place("feet_contact")], 0.0);
+        assert_eq!(terms(robust, false)[place("any_foot_contact")], 0.5);
+        assert_eq!(terms(robust, false)[place("fall")], 0.0);
+        assert_eq!(terms(robust, true)[place("fall")], -250.0);
+    });
+}
+
+#[test]
+fn the_mirrored_robot_has_the_mirrored_privileged_observation() {
+    for_each_robot(|robot| {
+        let robot = Arc::new(
+            Robot::load(
+                &std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+                    .join("../robots")
+                    .join(robot.name()),
+            )
+            .unwrap(),
+        );
+        let observation = ObservationLayout::new(&robot, HISTORY);
+        let kind = Kind::new(Arc::clone(&robot), observation);
+        let mirror = kind.privileged.mirror(&robot, &observation).unwrap();
+        let joints = robot.mirror().unwrap();
+        let numbers = |count: usize, shift: usize| -> Vec<f32> {
+            let number = |i: usize| (((i + shift) * 7) as f32 * 0.37).sin();
+            (0..count).map(number).collect()
+        };
+        let observed = |mirrored: bool| {
+            let mut stage = Stage::new(&robot).unwrap();
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let mut subject = Subject::new(&kind, &mut stage);
+            let mut parameters = BodyParameters {
+                hand_mass: [0.5, 1.5],
+                base_mass: 2.0,
+                base_com: [0.01, 0.02, -0.01],
+                p_gain: numbers(27, 3)
+                    .iter()
+                    .map(|x| 1.0 + 0.1 * f64::from(*x))
+                    .collect(),
+                ..BodyParameters::default()
+            };
+            if mirrored {
+                parameters.hand_mass.swap(0, 1);
+                parameters.base_com[1] *= -1.0;
+                let gains = parameters.p_gain.clone();
+                for (gain, &joint) in parameters.p_gain.iter_mut().zip(joints.permutation()) {
+                    *gain = gains[joint];
+                }
+            }
+            let seen = |values: &[f32], map: &dyn Fn(&[f32], &mut [f32])| {
+                let mut image = values.to_vec();
+                if mirrored {
+                    map(values, &mut image);
+                }
+                image
+            };
+            let goal_at = |t: usize| {
+                let rest = robot.goal_joints().iter().zip(numbers(15, t));
+                let goal: Vec<f32> = rest
+                    .map(|(joint, x)| joint.default as f32 + 0.2 * x)
+                    .collect();
+                seen(&goal, &|from, to| joints.goal(from, to))
+            };
+            subject.goal = goal_at(0);
+            let setup = EpisodeSetup {
+                parameters,
+                ranges: &Randomization::nominal(),
+                pushes: None,
+            };
+            subject.place(&kind, &mut stage, setup, &mut rng);
+            subject.observe();
+            for t in 0..8 {
+                let action = numbers(12, t).iter().map(|x| 0.3 * x).collect::<Vec<f32>>();
+                let action = seen(&action, &|from, to| joints.legs(from, to));
+                subject.execute(&kind, &mut stage, &action, &mut rng);
+                subject.remember(&action);
+                subject.goal = goal_at(t + 1);
+                subject.look_ahead(|ahead, goal| goal.copy_from_slice(&goal_at(t + 1 + ahead)));
+                subject.observe();
+            }
+            let mut privileged = vec![0.0; kind.privileged.width()];
+            subject.write_privileged(&kind, &mut privileged);
+            privileged
+        };
+        let (seen, image) = (observed(false), observed(true));
+        assert_eq!(mirror.rows(&mirror.rows(&seen)), seen);
+        for (i, (a, b)) in mirror.rows(&seen).iter().zip(&image).enumerate() {
+            // The solver's steps are not symmetric to the last bit.
+            assert!(
+                (a - b).abs() < 2e-2 * (1.0 + a.abs()),
+                "{}: {i}: {a} {b}",
+                robot.name()
+            );
+        }
+        assert!(
+            seen.iter()
+                .zip(&image)
+                .filter(|(a, b)| (*a - *b).abs() > 0.05)
+                .count()
+                > 20
+        );
+    });
+}
+
+#[test]
+fn the_robust_preset_can_be_run_and_its_sensors_are_not_the_truth() {
+    let robot = emp27();
+    let config = EnvironmentConfig::robust(&robot);
+    config.check(&robot).unwrap();
+    let json = serde_json::to_string(&config).unwrap();
+    assert_eq!(
+        serde_json::from_str::<EnvironmentConfig>(&json).unwrap(),
+        config
+    );
+    let mut environments = environments(config, 6, 2);
+    let (layout, privileged) = (
+        *environments.layout(),
+        environments.privileged_layout().clone(),
+    );
+    assert!(layout.heading_periods() > 0);
+    let mut noisy = 0;
+    for t in 0..100 {
+        let actions = actions(&environments, t);
+        environments.step(&actions);
+        let stacks = environments.observations().chunks_exact(layout.width());
+        let truths = environments.privileged().chunks_exact(privileged.width());
+        for (stack, truth) in stacks.zip(truths) {
+            // Roll is in the frame, what it does to gravity is known to the critic alone.
+            let roll = stack[layout.newest()][layout.orientation()][0];
+            let gravity = &truth[privileged.gravity.clone()];
+            let off = (roll - (-gravity[1]).atan2(-gravity[2])).abs();
+            assert!(off < 0.021, "{off}");
+            noisy += u32::from(off > 1e-4);
+        }
+    }
+    assert!(noisy > 500, "{noisy}");
 }

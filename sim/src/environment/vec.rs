@@ -32,6 +32,8 @@ pub struct Step<'a> {
     pub ends: &'a [Option<EndReason>],
     /// Control periods since the episode's start.
     pub lengths: &'a [u32],
+    /// Index of the clip that is played, or was until a moment ago.
+    pub clips: &'a [u32],
     /// Where an episode ended: the privileged observation at its end.
     pub final_privileged: &'a [f32],
 }
@@ -45,6 +47,7 @@ struct Batch {
     terms: Vec<f64>,
     ends: Vec<Option<EndReason>>,
     lengths: Vec<u32>,
+    clips: Vec<u32>,
 }
 
 impl VecEnvironment {
@@ -135,6 +138,12 @@ impl VecEnvironment {
         setting.difficulty = difficulty;
     }
 
+    /// How often each clip of the library is drawn from now on, as a multiple of how often it would be by its class and
+    /// length; clips without a weight have 1.
+    pub fn set_clip_weights(&mut self, weights: &[f32]) {
+        self.setting.library = Arc::new(self.setting.library.weighted(weights));
+    }
+
     /// Runs every environment for one control period; `actions` is N × leg joints, policy units.
     ///
     /// # Panics
@@ -156,6 +165,7 @@ impl VecEnvironment {
             batch.terms.par_chunks_exact_mut(REWARD_TERMS),
             batch.ends.par_iter_mut(),
             batch.lengths.par_iter_mut(),
+            batch.clips.par_iter_mut(),
         );
         self.pool.for_each(rows.into_par_iter(), |stage, row| {
             let (
@@ -168,6 +178,7 @@ impl VecEnvironment {
                 terms,
                 end,
                 length,
+                clip,
             ) = row;
             let mut slots = Slots {
                 observation,
@@ -177,6 +188,7 @@ impl VecEnvironment {
                 terms,
                 end,
                 length,
+                clip,
             };
             environment.step(setting, stage, action, &mut slots);
         });
@@ -185,6 +197,7 @@ impl VecEnvironment {
             terms: &batch.terms,
             ends: &batch.ends,
             lengths: &batch.lengths,
+            clips: &batch.clips,
             final_privileged: &batch.final_privileged,
         }
     }
@@ -250,6 +263,7 @@ impl Batch {
             terms: vec![0.0; count * REWARD_TERMS],
             ends: vec![None; count],
             lengths: vec![0; count],
+            clips: vec![0; count],
         }
     }
 }

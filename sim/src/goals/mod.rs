@@ -2,6 +2,7 @@
 
 mod clip;
 mod library;
+mod live;
 mod piece;
 mod statistics;
 mod stream;

@@ -3,6 +3,7 @@
 use emp_robot::Robot;
 use serde::{Deserialize, Serialize};
 
+use super::live::LiveStream;
 use super::{GoalClip, GoalError};
 
 /// A piece of a clip, as it is played.
@@ -19,6 +20,8 @@ pub(crate) struct Piece {
     /// Factor on the distance from the default pose.
     pub(crate) amplitude: f32,
     pub(crate) mirrored: bool,
+    /// The stream through which it comes; none: every control period has its own goal.
+    pub(crate) live: Option<LiveStream>,
 }
 
 impl Piece {
@@ -32,9 +35,19 @@ impl Piece {
         ((clip_frames - 1) as f64 - (periods - 1) as f64 * f64::from(tempo)).max(0.0)
     }
 
+    /// The same piece as it would be if every control period had its own goal.
+    pub(crate) fn steady(&self) -> Self {
+        Self {
+            live: None,
+            ..self.clone()
+        }
+    }
+
     /// The goal of control period `t` of this piece of `clip`; beyond the piece's end the clip goes on, beyond its own it rests.
     pub(crate) fn goal(&self, clip: &GoalClip, joints: &[GoalJoint], t: usize, out: &mut [f32]) {
-        let at = self.start + t as f64 * f64::from(self.tempo);
+        let now = t as f64;
+        let seen = self.live.map_or(now, |live| live.captured(now));
+        let at = self.start + seen * f64::from(self.tempo);
         if self.mirrored {
             clip.interpolate(at, |joint| joints[joint].partner, out);
         } else {

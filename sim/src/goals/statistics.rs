@@ -70,6 +70,25 @@ impl GoalStatistics {
     }
 }
 
+/// Speed of each frame's faster hand in the pelvis frame, m/s, slowest first; empty for a clip of one frame.
+pub(super) fn hand_speeds(robot: &Robot, clip: &GoalClip) -> Vec<f64> {
+    let mut kinematics = robot.kinematics().frame();
+    let mut before: Option<[Vector3<f64>; 2]> = None;
+    let mut speeds = Vec::with_capacity(clip.len());
+    for goal in clip.frames() {
+        let angles: Vec<f64> = goal.iter().map(|&angle| f64::from(angle)).collect();
+        kinematics.update(&angles);
+        let here = WRISTS.map(|node| kinematics.positions()[node]);
+        if let Some(before) = before {
+            let moved = here.iter().zip(&before).map(|(a, b)| (a - b).norm());
+            speeds.push(robot.control_rate_hz() * moved.fold(0.0, f64::max));
+        }
+        before = Some(here);
+    }
+    speeds.sort_by(f64::total_cmp);
+    speeds
+}
+
 impl Spread {
     fn of(mut values: Vec<f64>) -> Option<Self> {
         values.sort_by(f64::total_cmp);

@@ -14,9 +14,11 @@ const JOIN_SPEED: [f32; 2] = [1.0, 4.0];
 const SHORTEST_JOIN: usize = 15;
 /// Control periods in which the motion of the piece before fades, and that of the piece after is taken up.
 const FADE: f32 = (SHORTEST_JOIN + 1) as f32;
+/// Frames of a piece in which a robot that falls does so because of the piece before.
+const ECHO: usize = 20;
 
-/// An endless sequence of goals: random pieces of clips of up to 60 frames, each mirrored or not, faster or slower,
-/// wider or narrower about the default pose, joined by minimum-jerk movements that keep position and velocity
+/// An endless sequence of goals: random pieces of clips, at least 60 frames where the clip has them, each mirrored or not,
+/// faster or slower, wider or narrower about the default pose, some as a live stream would bring them, joined by minimum-jerk movements that keep position and velocity
 /// continuous and take as long as a person's joints need for the way (paper, section VI).
 ///
 /// The stream is a few numbers: indices, a generator, and the ends of the movements between pieces. It is cheap to
@@ -27,6 +29,8 @@ pub struct GoalStream {
     difficulty: f32,
     /// Frames of the current segment that were given.
     given: usize,
+    /// The clip of the piece before the current one.
+    clip_before: usize,
     current: Segment,
     next: Segment,
 }
@@ -89,6 +93,7 @@ impl GoalStream {
             rng,
             difficulty,
             given: 0,
+            clip_before: current.piece.clip,
             current,
         }
     }
@@ -100,6 +105,7 @@ impl GoalStream {
     pub fn next(&mut self, library: &GoalLibrary, goal: &mut [f32]) {
         if self.given == self.current.frames() {
             let after = Segment::after(&self.next.piece, library, self.difficulty, &mut self.rng);
+            self.clip_before = self.current.piece.clip;
             self.current = std::mem::replace(&mut self.next, after);
             self.given = 0;
         }
@@ -118,6 +124,23 @@ impl GoalStream {
             None => self.current.goal(library, t, goal),
             Some(t) => self.next.goal(library, t.min(self.next.frames() - 1), goal),
         }
+    }
+
+    /// The clip that the goals are of, or were of so few frames ago that what they did still shows.
+    pub(crate) fn clip(&self) -> usize {
+        let started = self.current.frames() - self.current.piece.frames;
+        if self.given < started + ECHO {
+            self.clip_before
+        } else {
+            self.current.piece.clip
+        }
+    }
+
+    /// Whether the goal that was given last came as a live stream brings it.
+    #[cfg(test)]
+    pub(super) fn is_live(&self) -> bool {
+        let started = self.current.frames() - self.current.piece.frames;
+        self.given > started && self.current.piece.live.is_some()
     }
 
     /// The largest amplitude of the pieces.
@@ -177,7 +200,9 @@ impl Join {
         let weight = minimum_jerk(f64::from(passed / (passed + left))) as f32;
         let from = self.from.moved(faded(passed / FADE));
         let to = self.to.moved(-faded(left / FADE));
-        for (((goal, joint), from), to) in goal.iter_mut().zip(&library.joints).zip(from).zip(to) {
+        for (((goal, joint), from), to) in
+            goal.iter_mut().zip(library.joints.iter()).zip(from).zip(to)
+        {
             let angle = from + weight * (to - from);
             *goal = angle.clamp(joint.range[0], joint.range[1]);
         }
@@ -187,9 +212,10 @@ impl Join {
 impl State {
     /// Position of frame `t` of a piece, velocity between two neighbouring frames.
     fn new(library: &GoalLibrary, piece: &Piece, t: usize, between: [usize; 2]) -> Self {
+        let piece = piece.steady();
         let goal = |t: usize| {
             let mut goal = vec![0.0; library.joints()];
-            library.goal(piece, t, &mut goal);
+            library.goal(&piece, t, &mut goal);
             goal
         };
         let [before, after] = between.map(goal);

@@ -8,6 +8,7 @@
 mod apply;
 mod body;
 mod fields;
+mod pace;
 mod parameters;
 mod rig;
 mod stage;
@@ -15,7 +16,7 @@ mod stage;
 mod tests;
 
 pub use body::{Body, FootReading, Reading, SelfContact};
-pub use parameters::BodyParameters;
+pub use parameters::{BodyParameters, Physics};
 pub use stage::{Stage, Start, Targets};
 
 pub(crate) use parameters::factor;

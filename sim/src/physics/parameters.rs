@@ -2,6 +2,17 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How exactly a robot is simulated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Physics {
+    /// As the robot's files say. Every judgement is made in it.
+    #[default]
+    Exact,
+    /// Fewer and longer physics steps, and a solver that stops sooner: for training alone.
+    Fast,
+}
+
 /// Physical parameters of one simulated robot, relative to the robot as its files describe it. The default is that robot.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BodyParameters {
@@ -28,6 +39,9 @@ pub struct BodyParameters {
     /// Time from a new target to when the motors follow it, seconds, at most one control period. It changes nothing of the
     /// model: the stage blends two targets.
     pub motor_delay: f64,
+    /// How exactly it is simulated. It changes nothing of the robot either.
+    #[serde(default)]
+    pub physics: Physics,
 }
 
 impl Default for BodyParameters {
@@ -44,6 +58,7 @@ impl Default for BodyParameters {
             motor_torque: Vec::new(),
             motor_damping: Vec::new(),
             motor_delay: 0.0,
+            physics: Physics::Exact,
         }
     }
 }

@@ -9,7 +9,8 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use super::apply::apply;
 use super::body::{Body, Reading, SelfContact};
 use super::fields::ModelFields;
-use super::parameters::BodyParameters;
+use super::pace::Pace;
+use super::parameters::{BodyParameters, Physics};
 use super::rig::{FootRig, Rig};
 use crate::{Divergence, SimError};
 
@@ -47,6 +48,9 @@ pub struct Stage {
     pub(super) data: MjData<Box<MjModel>>,
     /// What the model's fields are now.
     fields: Arc<ModelFields>,
+    /// The paces of exact and of fast physics, and which of them the model has now.
+    paces: [Pace; 2],
+    physics: Physics,
 }
 
 impl Stage {
@@ -66,6 +70,8 @@ impl Stage {
         model.opt_mut().disableflags |= MjtDisableBit::mjDSBL_AUTORESET as i32;
         let mut stage = Self {
             fields: Arc::clone(&rig.nominal),
+            paces: Pace::both(&model, rig.substeps),
+            physics: Physics::Exact,
             data: MjData::try_new(Box::new(model))?,
             rig,
         };
@@ -81,6 +87,7 @@ impl Stage {
         self.clear();
         let fields = self.derive(&start.parameters);
         self.load_fields(&fields);
+        self.set_physics(start.parameters.physics);
         let rig = Arc::clone(&self.rig);
         assert_eq!(
             start.joint_positions.len(),
@@ -161,7 +168,7 @@ impl Stage {
     }
 
     fn simulate(&mut self, body: &Body, targets: &Targets<'_>) -> Result<SelfContact, Divergence> {
-        let substeps = self.rig.substeps;
+        let substeps = self.pace().substeps;
         let delay = body.parameters.motor_delay / self.data.model_opt().timestep;
         let mut contact = SelfContact::default();
         for substep in 0..substeps {
@@ -192,11 +199,24 @@ impl Stage {
             }
         };
         self.load_fields(&fields);
+        self.set_physics(body.parameters.physics);
         self.data.qpos_mut().copy_from_slice(&body.qpos);
         self.data.qvel_mut().copy_from_slice(&body.qvel);
         self.data
             .qacc_warmstart_mut()
             .copy_from_slice(&body.warm_start);
+    }
+
+    fn pace(&self) -> Pace {
+        Pace::of(self.physics, &self.paces)
+    }
+
+    fn set_physics(&mut self, physics: Physics) {
+        if self.physics != physics {
+            self.physics = physics;
+            let pace = self.pace();
+            pace.write(self.model_mut());
+        }
     }
 
     fn load_fields(&mut self, fields: &Arc<ModelFields>) {
@@ -270,7 +290,7 @@ impl Stage {
     fn read(&self, body: &mut Body, self_contact: SelfContact) {
         let (qpos, qvel, rig) = (self.data.qpos(), self.data.qvel(), &*self.rig);
         let reading = &mut body.reading;
-        let period = rig.substeps as f64 * self.data.model_opt().timestep;
+        let period = self.pace().substeps as f64 * self.data.model_opt().timestep;
         for (joint, (&position, &velocity)) in rig.positions.iter().zip(&rig.velocities).enumerate()
         {
             reading.joint_positions[joint] = qpos[position] as f32;

@@ -42,6 +42,7 @@ fn odd(robot: &Robot, seed: usize) -> BodyParameters {
         motor_torque: factors(joints, 4),
         motor_damping: factors(joints, 5),
         motor_delay: 0.001 * step,
+        physics: Physics::Exact,
     }
 }
 
@@ -161,6 +162,7 @@ fn parameters_change_the_fields_that_they_name() {
             motor_torque: vec![0.7; 27],
             motor_damping: vec![3.0; 27],
             motor_delay: 0.0,
+            physics: Physics::Exact,
         };
         let _ = place(robot, &mut stage, parameters);
         let model = stage.data.model();
@@ -438,5 +440,39 @@ fn nominal_bodies_share_their_fields() {
         let bodies = [parameters, BodyParameters::default()].map(|p| place(robot, &mut stage, p));
         let [first, second] = bodies.map(|body| body.fields.unwrap());
         assert!(Arc::ptr_eq(&first, &second));
+    });
+}
+
+#[test]
+fn fast_physics_is_about_the_same_and_leaves_no_trace_on_the_stage() {
+    for_each_robot(|robot| {
+        let mut stage = Stage::new(robot).unwrap();
+        let run = |stage: &mut Stage, physics: Physics| {
+            let parameters = BodyParameters {
+                physics,
+                ..odd(robot, 1)
+            };
+            let mut body = place(robot, stage, parameters);
+            for t in 0..25 {
+                let goal = goal(robot, 0, t);
+                stage.step(
+                    &mut body,
+                    &Targets {
+                        goal: &goal,
+                        legs: &legs(robot),
+                    },
+                );
+            }
+            body.reading().clone()
+        };
+        let exact = run(&mut stage, Physics::Exact);
+        let fast = run(&mut stage, Physics::Fast);
+        assert_ne!(exact, fast, "{}", robot.name());
+        // Half a second on, the base is where it would be, but for millimetres.
+        let apart = (exact.position - fast.position).norm();
+        assert!(apart < 0.01, "{}: {apart} m", robot.name());
+        let turned = exact.orientation.angle_to(&fast.orientation);
+        assert!(turned < 0.03, "{}: {turned} rad", robot.name());
+        assert_eq!(run(&mut stage, Physics::Exact), exact, "{}", robot.name());
     });
 }

@@ -83,14 +83,15 @@ impl TrackingEnvironments {
     ) -> Result<Self, SimError> {
         settings.check(&robot)?;
         check_clips(&robot, &clips)?;
-        let setting = Arc::new(Setting::new(robot, settings, clips)?);
-        if policy.layout() != &setting.kind.observation {
-            return Err(SimError::Setting {
+        let observation = *policy.layout();
+        observation
+            .check(&robot)
+            .map_err(|found| SimError::Setting {
                 name: "policy".to_owned(),
-                expected: format!("one that reads {:?}", setting.kind.observation),
-                found: format!("{:?}", policy.layout()),
-            });
-        }
+                expected: format!("one for {}", robot.name()),
+                found,
+            })?;
+        let setting = Arc::new(Setting::new(robot, observation, settings, clips)?);
         let count = numbers.end.saturating_sub(numbers.start) as usize;
         let mut made: Vec<Option<Environment>> = (0..count).map(|_| None).collect();
         pool.for_each(made.par_iter_mut().enumerate(), |stage, (row, slot)| {

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use emp_models::observation::ObservationLayout;
 use emp_robot::Robot;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -33,12 +34,13 @@ pub(super) struct Setting {
 impl Setting {
     pub(super) fn new(
         robot: Arc<Robot>,
+        observation: ObservationLayout,
         settings: TrackingSettings,
         clips: Arc<[GoalClip]>,
     ) -> Result<Self, SimError> {
         Ok(Self {
             joints: GoalJoint::all(&robot)?,
-            kind: Kind::new(robot),
+            kind: Kind::new(robot, observation),
             limits: EnvironmentConfig::default(),
             loads: settings.loads(),
             full: Randomization::default(),
@@ -230,6 +232,7 @@ fn draw_piece(setting: &Setting, rng: &mut ChaCha8Rng) -> Piece {
         frames: periods,
         amplitude: within(Some(settings.amplitude), 1.0, rng) as f32,
         mirrored: rng.random_bool(0.5) && settings.mirrored,
+        live: None,
     }
 }
 

@@ -2,11 +2,12 @@
 
 use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 use clap::Args;
 use emp_models::{policy::Policy, retarget::Retargeter};
 use emp_sim::{Pool, Priority};
 use emp_training::{
+    change,
     emp::{
         data::{self, Motions},
         imagination::FrozenWorldModel,
@@ -163,9 +164,7 @@ pub(super) fn settings(arguments: &TrainingArguments) -> Result<EmpSettings> {
     let mut settings = EmpSettings::preset(arguments.preset);
     settings.seed = arguments.seed;
     for change in &arguments.changes {
-        let (key, value) = change
-            .split_once('=')
-            .with_context(|| format!("--set {change}: expected KEY=VALUE"))?;
+        let (key, value) = change::pair(change)?;
         settings.set(key, value)?;
     }
     settings.check()?;

@@ -11,6 +11,7 @@ pub(crate) mod policy_curves;
 pub(crate) mod policy_report;
 pub(crate) mod retarget_report;
 pub(crate) mod retargeter;
+pub(crate) mod skill_report;
 mod trial;
 pub(crate) mod world_model;
 pub(crate) mod world_model_report;

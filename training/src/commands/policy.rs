@@ -5,16 +5,17 @@ use std::{path::PathBuf, process::ExitCode, sync::Arc, time::Duration};
 use anyhow::{Result, ensure};
 use clap::Args;
 use emp_models::retarget::Retargeter;
+use emp_robot::Robot;
 use emp_sim::{
     Pool, Priority,
     goals::{GoalClip, GoalLibrary},
 };
 use emp_training::{
+    change,
     policy::{
-        self, Run,
+        self, Preset, Run,
         judge::Judge,
         remote::RemoteSource,
-        settings::{PpoSettings, Symmetry},
         source::{LocalSource, RolloutSource},
     },
     run::{Interrupt, Outcome, RunFiles},
@@ -33,33 +34,36 @@ pub(crate) struct Arguments {
     /// Weights of the retargeter [default: models/weights/ROBOT-retargeter.safetensors].
     #[arg(long, value_name = "FILE")]
     retargeter: Option<PathBuf>,
-    /// Where the weights go, f16 safetensors.
+    /// Where the weights go, f16 safetensors [default: weights.safetensors in the run's folder].
     #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    out: Option<PathBuf>,
     /// Environment steps to learn from; a resumed run may be given more.
     #[arg(long, default_value_t = 20_000_000)]
     steps: u64,
+    /// Settings to start from.
+    #[arg(long, value_enum, default_value_t = Preset::Robust)]
+    preset: Preset,
+    /// Change one setting, as in `environments=512` or `ppo.discount=0.99`; --print-settings shows all.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    changes: Vec<String>,
+    /// Print the settings as JSON and stop.
+    #[arg(long)]
+    print_settings: bool,
+    /// Folders (or files) of recorded motion of people who are not in --motions, by which weights are chosen.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    development: Vec<PathBuf>,
     /// Seed of weights, episodes and procedural skills.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Environments stepped side by side.
-    #[arg(long, default_value_t = 256)]
-    environments: usize,
-    /// Control periods collected between two updates.
-    #[arg(long, default_value_t = 32)]
-    horizon: usize,
-    /// Procedural clips in the mix.
-    #[arg(long, default_value_t = 1000)]
-    procedural_clips: usize,
-    /// How left–right symmetry is used.
-    #[arg(long, value_enum, default_value_t = Symmetry::None)]
-    symmetry: Symmetry,
     /// Servers that simulate, for example `http://host:50051`; without any, this machine does. A resumed run needs as many.
     #[arg(long, num_args = 1.., value_name = "URL")]
     remote: Vec<String>,
     /// Continue the run from its checkpoint.
     #[arg(long)]
     resume: bool,
+    /// Let a resumed run go on with other settings or motion than it had.
+    #[arg(long, requires = "resume")]
+    change_settings: bool,
     /// Folder of the run's checkpoint and log [default: runs/policy-ROBOT].
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
@@ -73,45 +77,39 @@ pub(crate) struct Arguments {
 
 /// Trains a policy.
 pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
-    ensure!(
-        arguments.environments > 0 && arguments.horizon > 0 && arguments.steps > 0,
-        "--environments, --horizon and --steps must be at least 1"
-    );
+    ensure!(arguments.steps > 0, "--steps must be at least 1");
     let robot = arguments.robot.load()?;
+    let settings = settings(arguments, &robot)?;
+    if arguments.print_settings {
+        println!("{}", serde_json::to_string_pretty(&settings)?);
+        return Ok(ExitCode::SUCCESS);
+    }
     let folder = arguments
         .run
         .clone()
         .unwrap_or_else(|| PathBuf::from(format!("runs/policy-{}", robot.name())));
+    let weights = arguments.out.clone();
     let files = RunFiles {
+        weights: weights.unwrap_or_else(|| folder.join("weights.safetensors")),
         folder,
-        weights: arguments.out.clone(),
         save_every: Duration::from_secs(arguments.save_every),
-    };
-    let settings = policy::Settings {
-        seed: arguments.seed,
-        environments: arguments.environments,
-        horizon: arguments.horizon,
-        procedural_clips: arguments.procedural_clips,
-        ppo: PpoSettings {
-            symmetry: arguments.symmetry,
-            ..PpoSettings::default()
-        },
-        ..policy::Settings::default()
     };
     let checkpoint = files.checkpoint();
     refuse_overwriting(&checkpoint, arguments.resume)?;
     let weights = retargeter_weights(arguments.retargeter.as_ref(), &robot);
     let retargeter = Retargeter::load(&weights, Arc::clone(&robot))?;
-    let (library, data) = goal_library(arguments, &retargeter)?;
+    let (library, data) = goal_library(arguments, &settings, &retargeter)?;
+    let library = Arc::new(library);
     let pool = Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?);
     let judge = Judge::new(
         &retargeter,
+        &arguments.development,
         settings.evaluation_clips,
         Arc::clone(&pool),
         arguments.threads,
     )?;
     let mut source: Box<dyn RolloutSource> = if arguments.remote.is_empty() {
-        let library = Arc::new(library);
+        let library = Arc::clone(&library);
         Box::new(LocalSource::new(&robot, &pool, &settings, library)?)
     } else {
         Box::new(RemoteSource::new(
@@ -125,12 +123,14 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         policy::Trainer::resume(
             robot,
             settings,
+            library,
             arguments.threads,
             &checkpoint,
             source.as_mut(),
+            arguments.change_settings,
         )?
     } else {
-        policy::Trainer::new(robot, settings, arguments.threads)?
+        policy::Trainer::new(robot, settings, library, arguments.threads)?
     };
     let interrupt = Interrupt::listen()?;
     let mut run = Run {
@@ -143,22 +143,35 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     eprintln!("{}", trainer.times());
     match outcome {
         Outcome::Finished => {
-            eprintln!("wrote {}", arguments.out.display());
+            eprintln!("wrote {}", run.files.weights.display());
             Ok(ExitCode::SUCCESS)
         }
         Outcome::Interrupted => Ok(interrupted(trainer.steps())),
     }
 }
 
+/// The preset's settings with the arguments' changes.
+fn settings(arguments: &Arguments, robot: &Robot) -> Result<policy::Settings> {
+    let mut settings = policy::Settings::preset(arguments.preset, robot);
+    settings.seed = arguments.seed;
+    for change in &arguments.changes {
+        let (key, value) = change::pair(change)?;
+        settings.set(key, value)?;
+    }
+    settings.check()?;
+    Ok(settings)
+}
+
 fn goal_library(
     arguments: &Arguments,
+    settings: &policy::Settings,
     retargeter: &Retargeter,
 ) -> Result<(GoalLibrary, serde_json::Value)> {
     let (library, data) = policy::data::library(
         retargeter,
         &arguments.motions,
-        arguments.procedural_clips,
-        arguments.seed,
+        settings.procedural_clips,
+        settings.seed,
         arguments.threads,
     )?;
     let frames: usize = library.clips().map(GoalClip::len).sum();

@@ -1,6 +1,6 @@
 //! Settings of an EMP's training. Two runs with the same settings, data and binary make the same bits.
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Result, bail};
 use emp_models::{
     emp::{DangerGate, EmpConfig, Output},
     observation::{HISTORY, HistoryMap, ObservationLayout},
@@ -10,6 +10,7 @@ use emp_sim::tracking::TrackingSettings;
 use serde::{Deserialize, Serialize};
 
 use super::losses::{CenOn, CenRef, Distance, LossSettings, LossWeights, SmoothOn};
+use crate::change;
 
 /// A set of settings with a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -337,17 +338,7 @@ impl EmpSettings {
     /// # Errors
     /// When there is no such setting, or it cannot have that value.
     pub fn set(&mut self, key: &str, value: &str) -> Result<()> {
-        let mut settings = serde_json::to_value(&*self)?;
-        let place = key
-            .split('.')
-            .try_fold(&mut settings, |place, name| place.get_mut(name));
-        let Some(place) = place else {
-            bail!("no setting `{key}`; --print-settings shows all");
-        };
-        *place = serde_json::from_str(value)
-            .unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
-        *self = serde_json::from_value(settings)
-            .with_context(|| format!("setting `{key}` cannot be {value}"))?;
+        *self = change::setting(self, key, value)?;
         Ok(())
     }
 

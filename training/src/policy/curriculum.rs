@@ -37,7 +37,7 @@ impl Ramp {
 pub struct CurriculumSettings {
     /// Scale of the domain randomisation; 1 is the paper's.
     pub randomization: Ramp,
-    /// Scale of the goals' amplitude and speed; 1 is the motion as recorded.
+    /// Largest amplitude of the goals, which speed rises with; 1 is the motion as recorded.
     pub difficulty: Ramp,
     /// Scales rise while the mean length of episodes is above this share of the longest possible.
     pub rise_above: f64,
@@ -60,7 +60,7 @@ impl Default for CurriculumSettings {
             },
             difficulty: Ramp {
                 start: 0.8,
-                end: 1.3,
+                end: 2.0,
                 rise: 0.02,
                 fall: 0.01,
             },
@@ -102,6 +102,14 @@ impl Curriculum {
             recent: VecDeque::new(),
             updates: 0,
         }
+    }
+
+    /// Takes over how far a curriculum with other settings was.
+    pub fn resume_from(&mut self, other: &Self) {
+        let within = |ramp: Ramp, scale: f64| scale.clamp(ramp.start, ramp.end);
+        self.randomization = within(self.settings.randomization, other.randomization);
+        self.difficulty = within(self.settings.difficulty, other.difficulty);
+        self.updates = other.updates;
     }
 
     /// Scale of the domain randomisation.
@@ -189,8 +197,17 @@ mod tests {
         run(1.0, 500, &mut curriculum);
         assert_eq!(
             (curriculum.randomization(), curriculum.difficulty()),
-            (1.0, 1.3)
+            (1.0, 2.0)
         );
+        let mut other = Curriculum::new(CurriculumSettings {
+            difficulty: Ramp {
+                end: 1.5,
+                ..CurriculumSettings::default().difficulty
+            },
+            ..CurriculumSettings::default()
+        });
+        other.resume_from(&curriculum);
+        assert_eq!((other.randomization(), other.difficulty()), (1.0, 1.5));
     }
 
     #[test]

@@ -5,9 +5,9 @@
 
 use std::time::Instant;
 
-use anyhow::{Context as _, Result, ensure};
-use candle_core::{Device, Tensor, backprop::GradStore};
+use anyhow::{Context as _, Result};
 use emp_models::{
+    Mirror,
     checkpoint::Tensors,
     mlp::Normalizer,
     optimizer::{Adam, AdamConfig},
@@ -20,22 +20,15 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     moments::RunningMoments,
-    network::{ActorCritic, Widths},
+    network::{ActorCritic, Gradient, Symmetry, Weights, Widths},
     objective::{self, Losses, Samples},
     returns::{self, Trajectories},
-    settings::{PpoSettings, Symmetry},
-    symmetry::FeatureMirror,
+    settings::PpoSettings,
 };
-use crate::{
-    rows::{self, gather, gathered, tensor},
-    variables,
-};
+use crate::{rows::gather, variables};
 
 /// Rows of a forward pass without gradient.
 const ROWS: usize = 1024;
-
-/// Weight of the mirror loss, beside the sum of squares over actions.
-const MIRROR_WEIGHT: f64 = 0.5;
 
 /// Names of the moments in a checkpoint.
 const FEATURES: &str = "moments.features";
@@ -50,7 +43,6 @@ pub struct Learner {
     adam: Adam,
     features: RunningMoments,
     privileged: RunningMoments,
-    mirror: Option<FeatureMirror>,
     progress: Progress,
     threads: rayon::ThreadPool,
 }
@@ -88,22 +80,18 @@ pub struct UpdateStatistics {
 }
 
 impl Learner {
-    /// A learner with random weights; `mirror` is what [`Symmetry`] needs.
+    /// A learner with random weights, symmetric with a `symmetry`.
     ///
     /// # Errors
-    /// When symmetry is asked for without a mirror, or the system gives no threads.
+    /// When the system gives no threads.
     pub fn new(
         widths: Widths,
         settings: PpoSettings,
-        mirror: Option<FeatureMirror>,
+        symmetry: Option<Symmetry>,
         seed: u64,
         threads: usize,
     ) -> Result<Self> {
-        ensure!(
-            settings.symmetry == Symmetry::None || mirror.is_some(),
-            "symmetry needs a robot with a mirror image"
-        );
-        let network = ActorCritic::new(widths, &settings, seed)?;
+        let network = ActorCritic::new(widths, &settings, symmetry, seed)?;
         let config = AdamConfig {
             epsilon: 1e-5,
             max_gradient_norm: settings.max_gradient_norm,
@@ -126,7 +114,6 @@ impl Learner {
             seed,
             widths,
             network,
-            mirror,
         })
     }
 
@@ -145,7 +132,24 @@ impl Learner {
 
     /// The normalisation of the actor's features.
     pub fn normalizer(&self) -> Normalizer {
-        self.features.normalizer()
+        match self.network.symmetry() {
+            Some(symmetry) => self
+                .features
+                .symmetrized(&symmetry.policy.features)
+                .normalizer(),
+            None => self.features.normalizer(),
+        }
+    }
+
+    /// The normalisation of what the critic reads.
+    fn privileged_normalizer(&self) -> Normalizer {
+        match self.network.symmetry() {
+            Some(symmetry) => self
+                .privileged
+                .symmetrized(&symmetry.privileged)
+                .normalizer(),
+            None => self.privileged.normalizer(),
+        }
     }
 
     /// Logarithms of the deviations of exploration.
@@ -153,7 +157,7 @@ impl Learner {
     /// # Errors
     /// When the tensor library fails.
     pub fn log_std(&self) -> Result<Vec<f32>> {
-        Ok(self.network.log_std().to_vec1()?)
+        Ok(self.network.weights()?.log_std)
     }
 
     /// Weights, moments and the optimiser's state, for a checkpoint.
@@ -214,20 +218,30 @@ impl Learner {
     /// Normalises a rollout and works out what is to be learnt from it.
     fn batch(&self, rollout: &Rollout) -> Result<Batch> {
         let log_std = self.log_std()?;
-        let normalizer = self.privileged.normalizer();
-        let values = |rows: &[f32]| self.values(&normalized(rows, &normalizer));
-        let state_values = values(&rollout.privileged)?;
+        let normalizer = self.privileged_normalizer();
+        let privileged = Rows::new(
+            normalized(&rollout.privileged, &normalizer),
+            self.network.symmetry().map(|symmetry| &symmetry.privileged),
+        );
+        let state_values = self.values(&privileged)?;
+        let later_values = |rows: &[f32]| {
+            let mirror = self.network.symmetry().map(|symmetry| &symmetry.privileged);
+            self.values(&Rows::new(normalized(rows, &normalizer), mirror))
+        };
         let mut rewards = rollout.rewards.clone();
-        for (index, privileged) in &rollout.timed_out_privileged {
+        let timed_out = rollout.timed_out_privileged.iter();
+        let states: Vec<f32> = timed_out.flat_map(|(_, state)| state).copied().collect();
+        let values = later_values(&states)?;
+        for ((index, _), value) in rollout.timed_out_privileged.iter().zip(values) {
             // The episode would have gone on: what it would have earned counts.
-            rewards[*index] += self.settings.discount as f32 * values(privileged)?[0];
+            rewards[*index] += self.settings.discount as f32 * value;
         }
         let ended: Vec<bool> = rollout.ends.iter().map(|end| *end != End::None).collect();
         let trajectories = Trajectories {
             environments: rollout.environments,
             rewards: &rewards,
             values: &state_values,
-            last_values: &values(&rollout.last_privileged)?,
+            last_values: &later_values(&rollout.last_privileged)?,
             ended: &ended,
         };
         let advantages = returns::advantages(
@@ -240,56 +254,36 @@ impl Learner {
             .zip(&state_values)
             .map(|(a, v)| a + v)
             .collect();
-        let original = View {
-            features: normalized(&rollout.features, &self.features.normalizer()),
-            actions: rollout.actions.clone(),
-            means: rollout.means.clone(),
-        };
+        let mirror = self.network.symmetry().map(|symmetry| &symmetry.policy);
         Ok(Batch {
-            log_probabilities: self.log_probabilities(rollout, &log_std)?,
+            log_probabilities: objective::log_probabilities(
+                &rollout.actions,
+                &rollout.means,
+                &log_std,
+            ),
             explained_variance: returns::explained_variance(&returns, &advantages),
             advantages: returns::standardized(&advantages),
             returns,
-            privileged: normalized(&rollout.privileged, &normalizer),
-            mirrored: self.mirrored(rollout),
-            original,
+            features: Rows::new(
+                normalized(&rollout.features, &self.normalizer()),
+                mirror.map(|mirror| &mirror.features),
+            ),
+            privileged,
+            actions: rollout.actions.clone(),
+            means: rollout.means.clone(),
             log_std,
         })
     }
 
-    /// The rollout in the mirror, where symmetry is used.
-    fn mirrored(&self, rollout: &Rollout) -> Option<View> {
-        if self.settings.symmetry == Symmetry::None {
-            return None;
-        }
-        let mirror = self.mirror.as_ref()?;
-        Some(View {
-            features: normalized(
-                &mirror.features(&rollout.features),
-                &self.features.normalizer(),
-            ),
-            actions: mirror.actions(&rollout.actions),
-            means: mirror.actions(&rollout.means),
-        })
-    }
-
-    fn log_probabilities(&self, rollout: &Rollout, log_std: &[f32]) -> Result<Vec<f32>> {
-        let actions = tensor(&rollout.actions, self.widths.actions)?;
-        let means = tensor(&rollout.means, self.widths.actions)?;
-        let log_std = Tensor::new(log_std, &Device::Cpu)?;
-        Ok(objective::log_probabilities(&actions, &means, &log_std)?.to_vec1()?)
-    }
-
     /// Values of normalised privileged observations.
-    fn values(&self, privileged: &[f32]) -> Result<Vec<f32>> {
+    fn values(&self, privileged: &Rows) -> Result<Vec<f32>> {
         let width = self.widths.privileged;
-        let chunk = |rows: &[f32]| -> Result<Vec<f32>> {
-            Ok(self.network.values(&tensor(rows, width)?)?.to_vec1()?)
-        };
-        let chunks = self.threads.install(|| {
-            let chunks = privileged.par_chunks(ROWS * width).map(chunk);
-            chunks.collect::<Result<Vec<_>>>()
-        })?;
+        let weights = self.network.weights()?;
+        let indices: Vec<usize> = (0..privileged.rows.len() / width).collect();
+        let chunk = |rows: &[usize]| weights.values(privileged.gathered(width, rows)).numbers;
+        let chunks: Vec<Vec<f32>> = self
+            .threads
+            .install(|| indices.par_chunks(ROWS).map(chunk).collect());
         Ok(chunks.concat())
     }
 
@@ -300,11 +294,10 @@ impl Learner {
         let mut order: Vec<usize> = (0..batch.returns.len()).collect();
         let rows = order.len().div_ceil(self.settings.mini_batches);
         let mut sums = Sums::default();
-        for epoch in 0..self.settings.epochs {
+        for _ in 0..self.settings.epochs {
             order.shuffle(&mut rng);
-            let mirrored = epoch % 2 == 1 && self.settings.symmetry == Symmetry::Augmentation;
             for rows in order.chunks(rows) {
-                self.step(batch, rows, mirrored, &mut sums)
+                self.step(batch, rows, &mut sums)
                     .with_context(|| format!("update {}", self.progress.updates))?;
             }
         }
@@ -321,20 +314,15 @@ impl Learner {
     }
 
     /// One step of the optimiser on the given rows.
-    fn step(
-        &mut self,
-        batch: &Batch,
-        rows: &[usize],
-        mirrored: bool,
-        sums: &mut Sums,
-    ) -> Result<()> {
+    fn step(&mut self, batch: &Batch, rows: &[usize], sums: &mut Sums) -> Result<()> {
         let shard_rows = rows.len().div_ceil(self.settings.shards);
-        let shards = self.threads.install(|| {
+        let weights = self.network.weights()?;
+        let shards: Vec<Shard> = self.threads.install(|| {
             let shards = rows.par_chunks(shard_rows);
             shards
-                .map(|shard| self.shard(batch, shard, rows.len(), mirrored))
-                .collect::<Result<Vec<_>>>()
-        })?;
+                .map(|shard| self.shard(batch, &weights, shard))
+                .collect()
+        });
         let divergence: f64 = shards.iter().map(|shard| shard.divergence).sum();
         let rate = &mut self.progress.learning_rate;
         *rate = objective::adapted_learning_rate(
@@ -346,71 +334,57 @@ impl Learner {
         sums.divergence += divergence;
         sums.policy += shards.iter().map(|shard| shard.policy).sum::<f64>();
         sums.value += shards.iter().map(|shard| shard.value).sum::<f64>();
-        let gradients = shards.into_iter().map(|shard| shard.gradient);
-        let gradient = rows::add_gradients(gradients, &[self.network.vars()])?;
-        sums.gradient_norm += self.adam.step(&gradient, self.progress.learning_rate)?;
+        let mut gradients = shards.into_iter().map(|shard| shard.gradient);
+        let mut gradient = gradients.next().context("a mini-batch has no rows")?;
+        gradients.for_each(|part| gradient.add(&part));
+        gradient.divide(rows.len() as f32);
+        let rate = self.progress.learning_rate;
+        sums.gradient_norm += self.adam.step_by_name(gradient.0, rate)?;
         self.network.bound_std(self.settings.min_std)?;
         Ok(())
     }
 
-    /// The gradient of one shard of a mini-batch of `total` rows.
-    fn shard(&self, batch: &Batch, rows: &[usize], total: usize, mirrored: bool) -> Result<Shard> {
-        let settings = &self.settings;
-        let view = match (&batch.mirrored, mirrored) {
-            (Some(view), true) => view,
-            _ => &batch.original,
+    /// What one shard of a mini-batch adds to the gradient.
+    fn shard(&self, batch: &Batch, weights: &Weights<'_>, rows: &[usize]) -> Shard {
+        let column = |values: &[f32]| gather(values, 1, rows);
+        let samples = Samples {
+            actions: gather(&batch.actions, self.widths.actions, rows),
+            log_probabilities: column(&batch.log_probabilities),
+            advantages: column(&batch.advantages),
+            returns: column(&batch.returns),
         };
-        let samples = self.samples(batch, view, rows)?;
-        let features = gathered(&view.features, self.widths.features, rows)?;
-        let privileged = gathered(&batch.privileged, self.widths.privileged, rows)?;
-        let means = self.network.means(&features)?;
-        let values = self.network.values(&privileged)?;
-        let log_std = self.network.log_std();
-        let losses = Losses::new(&samples, &means, log_std, &values, settings.clip)?;
-        let mut loss = losses.total(settings)?;
-        let new_means = means.flatten_all()?.to_vec1::<f32>()?;
-        if let (Symmetry::Loss, Some(mirrored), Some(mirror)) =
-            (settings.symmetry, &batch.mirrored, &self.mirror)
-        {
-            let features = gathered(&mirrored.features, self.widths.features, rows)?;
-            let target = tensor(&mirror.actions(&new_means), self.widths.actions)?;
-            let error = (self.network.means(&features)? - target)?
-                .sqr()?
-                .sum_all()?;
-            loss = (loss + (error * MIRROR_WEIGHT)?)?;
-        }
-        let old_means = gather(&view.means, self.widths.actions, rows);
-        Ok(Shard {
-            divergence: objective::divergence(
-                &old_means,
-                &new_means,
-                &batch.log_std,
-                &log_std.to_vec1()?,
+        let means = weights.means(batch.features.gathered(self.widths.features, rows));
+        let values = weights.values(batch.privileged.gathered(self.widths.privileged, rows));
+        let log_std = &weights.log_std;
+        let losses = Losses::new(
+            &samples,
+            &means.numbers,
+            log_std,
+            &values.numbers,
+            &self.settings,
+        );
+        let old_means = gather(&batch.means, self.widths.actions, rows);
+        Shard {
+            divergence: objective::divergence(&old_means, &means.numbers, &batch.log_std, log_std),
+            policy: losses.policy,
+            value: losses.value,
+            gradient: weights.gradient(
+                (&means, losses.by_means),
+                (&values, losses.by_values),
+                losses.by_log_std,
             ),
-            policy: f64::from(losses.policy.to_scalar::<f32>()?),
-            value: f64::from(losses.value.to_scalar::<f32>()?),
-            gradient: (loss / total as f64)?.backward()?,
-        })
-    }
-
-    fn samples(&self, batch: &Batch, view: &View, rows: &[usize]) -> Result<Samples> {
-        let column =
-            |values: &[f32]| Tensor::from_vec(gather(values, 1, rows), rows.len(), &Device::Cpu);
-        Ok(Samples {
-            actions: gathered(&view.actions, self.widths.actions, rows)?,
-            log_probabilities: column(&batch.log_probabilities)?,
-            advantages: column(&batch.advantages)?,
-            returns: column(&batch.returns)?,
-        })
+        }
     }
 }
 
 /// A rollout, ready to learn from.
 struct Batch {
-    original: View,
-    /// The same in the mirror, where symmetry is used.
-    mirrored: Option<View>,
-    privileged: Vec<f32>,
+    /// What the actor saw.
+    features: Rows,
+    /// What the critic saw.
+    privileged: Rows,
+    actions: Vec<f32>,
+    means: Vec<f32>,
     log_probabilities: Vec<f32>,
     advantages: Vec<f32>,
     returns: Vec<f32>,
@@ -419,16 +393,34 @@ struct Batch {
     explained_variance: f64,
 }
 
-/// What the actor saw and did.
-struct View {
-    features: Vec<f32>,
-    actions: Vec<f32>,
-    means: Vec<f32>,
+/// Normalised rows, and their mirror images where the networks are symmetric.
+struct Rows {
+    rows: Vec<f32>,
+    images: Option<Vec<f32>>,
+}
+
+impl Rows {
+    fn new(rows: Vec<f32>, mirror: Option<&Mirror>) -> Self {
+        let images = mirror.map(|mirror| mirror.rows(&rows));
+        Self { rows, images }
+    }
+
+    /// The rows of these numbers, followed by their images.
+    fn gathered(&self, width: usize, rows: &[usize]) -> Vec<f32> {
+        let sides = [Some(&self.rows), self.images.as_ref()];
+        let mut gathered = Vec::with_capacity(2 * rows.len() * width);
+        for side in sides.into_iter().flatten() {
+            for row in rows {
+                gathered.extend_from_slice(&side[row * width..(row + 1) * width]);
+            }
+        }
+        gathered
+    }
 }
 
 /// What one shard of a mini-batch adds.
 struct Shard {
-    gradient: GradStore,
+    gradient: Gradient,
     divergence: f64,
     policy: f64,
     value: f64,
@@ -452,6 +444,7 @@ fn normalized(rows: &[f32], normalizer: &Normalizer) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use emp_models::policy::PolicyMirror;
     use rand::RngExt as _;
 
     const ENVIRONMENTS: usize = 32;
@@ -486,11 +479,12 @@ mod tests {
             };
             for t in 0..HORIZON {
                 let features = normalized(&self.positions, &learner.normalizer());
-                let means = learner
-                    .network
-                    .means(&tensor(&features, 1).unwrap())
-                    .unwrap();
-                let means = means.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                let both: Vec<f32> = features
+                    .iter()
+                    .copied()
+                    .chain(features.iter().map(|x| -x))
+                    .collect();
+                let means = learner.network.weights().unwrap().means(both).numbers;
                 rollout.features.extend(&self.positions);
                 rollout.privileged.extend(self.privileged());
                 for (n, mean) in means.into_iter().enumerate() {
@@ -526,6 +520,14 @@ mod tests {
     }
 
     fn learner(threads: usize) -> Learner {
+        // The points are their own mirror image about zero: so is what there is to learn.
+        let symmetry = Symmetry {
+            policy: PolicyMirror {
+                features: Mirror::signs(&[-1.0]),
+                actions: Mirror::signs(&[-1.0]),
+            },
+            privileged: Mirror::signs(&[-1.0, 1.0]),
+        };
         let widths = Widths {
             features: 1,
             privileged: 2,
@@ -537,7 +539,7 @@ mod tests {
             initial_std: 0.5,
             ..PpoSettings::default()
         };
-        Learner::new(widths, settings, None, 11, threads).unwrap()
+        Learner::new(widths, settings, Some(symmetry), 11, threads).unwrap()
     }
 
     fn mean_reward(rollout: &Rollout) -> f32 {

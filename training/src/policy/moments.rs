@@ -2,7 +2,7 @@
 
 use anyhow::{Context as _, Result, ensure};
 use candle_core::{Device, Tensor};
-use emp_models::{checkpoint::Tensors, mlp::Normalizer};
+use emp_models::{Mirror, checkpoint::Tensors, mlp::Normalizer};
 
 /// Added to each deviation, so that a constant feature has a finite scale.
 const EPSILON: f64 = 1e-4;
@@ -58,6 +58,19 @@ impl RunningMoments {
             self.mean[i] += shift * count / total;
         }
         self.rows = total;
+    }
+
+    /// The moments of the rows and their mirror images together.
+    #[must_use]
+    pub fn symmetrized(&self, mirror: &Mirror) -> Self {
+        let mut both = self.clone();
+        for (i, (partner, sign)) in mirror.places().enumerate() {
+            let (mean, image) = (self.mean[i], f64::from(sign) * self.mean[partner]);
+            both.mean[i] = 0.5 * (mean + image);
+            both.variance[i] =
+                0.5 * (self.variance[i] + self.variance[partner]) + 0.25 * (mean - image).powi(2);
+        }
+        both
     }
 
     /// What brings features to zero mean and unit deviation.
@@ -146,6 +159,22 @@ mod tests {
                 (f64::from(normalizer.scale[column]) - 1.0 / (variance.sqrt() + 1e-4)).abs() < 1e-6
             );
         }
+    }
+
+    #[test]
+    fn symmetrized_moments_are_those_of_the_rows_and_their_images() {
+        let mirror = Mirror::chain([Mirror::sides(), Mirror::signs(&[-1.0])]);
+        let mut moments = RunningMoments::new(3);
+        moments.update(&rows());
+        let symmetric = moments.symmetrized(&mirror);
+        moments.update(&mirror.rows(&rows()));
+        for i in 0..3 {
+            assert!((symmetric.mean[i] - moments.mean[i]).abs() < 1e-9);
+            assert!((symmetric.variance[i] - moments.variance[i]).abs() < 1e-9);
+        }
+        let normalizer = symmetric.normalizer();
+        assert_eq!(mirror.rows(&normalizer.mean), normalizer.mean);
+        assert_eq!(mirror.unsigned().rows(&normalizer.scale), normalizer.scale);
     }
 
     #[test]

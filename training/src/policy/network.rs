@@ -1,13 +1,16 @@
 //! The actor and the critic.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Context as _, Result};
 use candle_core::{DType, Device, Tensor, Var};
 use candle_nn::{VarBuilder, VarMap};
-use emp_models::{checkpoint::Tensors, mlp::Mlp};
+use emp_models::{Mirror, checkpoint::Tensors, mlp::Mlp, policy::PolicyMirror};
 use nalgebra::DMatrix;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
+use super::layers::{Activations, Layers};
 use super::settings::PpoSettings;
 use crate::variables;
 
@@ -34,12 +37,25 @@ pub struct Widths {
     pub actions: usize,
 }
 
+/// What makes actor and critic symmetric.
+#[derive(Clone, Debug)]
+pub struct Symmetry {
+    /// The mirror of features and actions.
+    pub policy: PolicyMirror,
+    /// The mirror of what the critic reads.
+    pub privileged: Mirror,
+}
+
 /// A Gaussian policy with a state-independent deviation, and the value of a state. Inputs are normalised.
+///
+/// With a [`Symmetry`], the mean action is ½ (f(s) + M f(M s)) and the value ½ (v(s) + v(M s)): rows are then followed by
+/// their mirror images. The deviations of mirrored joints are the same.
 pub struct ActorCritic {
     vars: VarMap,
-    actor: Mlp,
-    critic: Mlp,
+    /// Layers of actor and critic.
+    depths: [usize; 2],
     log_std: Var,
+    symmetry: Option<Symmetry>,
 }
 
 impl ActorCritic {
@@ -47,18 +63,25 @@ impl ActorCritic {
     ///
     /// # Errors
     /// When a tensor cannot be made.
-    pub fn new(widths: Widths, settings: &PpoSettings, seed: u64) -> Result<Self> {
+    pub fn new(
+        widths: Widths,
+        settings: &PpoSettings,
+        symmetry: Option<Symmetry>,
+        seed: u64,
+    ) -> Result<Self> {
         let vars = VarMap::new();
         let builder = VarBuilder::from_varmap(&vars, DType::F32, &Device::Cpu);
         let (actor, critic) = (&settings.actor_hidden, &settings.critic_hidden);
+        Mlp::new(widths.features, actor, widths.actions, &builder.pp(ACTOR))?;
+        Mlp::new(widths.privileged, critic, 1, &builder.pp(CRITIC))?;
         let network = Self {
-            actor: Mlp::new(widths.features, actor, widths.actions, &builder.pp(ACTOR))?,
-            critic: Mlp::new(widths.privileged, critic, 1, &builder.pp(CRITIC))?,
+            depths: [actor.len() + 1, critic.len() + 1],
             log_std: Var::new(
                 vec![settings.initial_std.ln() as f32; widths.actions],
                 &Device::Cpu,
             )?,
             vars,
+            symmetry,
         };
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         variables::initialise(&network.vars, &mut rng)?;
@@ -88,34 +111,43 @@ impl ActorCritic {
         Ok(())
     }
 
-    /// Mean actions (N × actions) for normalised features (N × features).
+    /// What makes it symmetric, if it is.
+    pub fn symmetry(&self) -> Option<&Symmetry> {
+        self.symmetry.as_ref()
+    }
+
+    /// The weights as they are now.
     ///
     /// # Errors
-    /// When the features have another width.
-    pub fn means(&self, features: &Tensor) -> candle_core::Result<Tensor> {
-        self.actor.forward(features)
+    /// When the variables' lock is poisoned.
+    pub fn weights(&self) -> Result<Weights<'_>> {
+        let vars = variables::lock(&self.vars)?;
+        Ok(Weights {
+            actor: Layers::read(&vars, ACTOR, self.depths[0])?,
+            critic: Layers::read(&vars, CRITIC, self.depths[1])?,
+            log_std: self.log_std.to_vec1()?,
+            symmetry: self.symmetry.as_ref(),
+        })
     }
 
-    /// Values (N) for normalised privileged observations (N × privileged).
-    ///
-    /// # Errors
-    /// When the observations have another width.
-    pub fn values(&self, privileged: &Tensor) -> candle_core::Result<Tensor> {
-        self.critic.forward(privileged)?.flatten_all()
-    }
-
-    /// Logarithms of the deviations.
-    pub fn log_std(&self) -> &Tensor {
-        self.log_std.as_tensor()
-    }
-
-    /// Keeps each deviation at `min_std` or above.
+    /// Keeps each deviation at `min_std` or above, and alike on both sides.
     ///
     /// # Errors
     /// When the tensor library fails.
     pub fn bound_std(&self, min_std: f64) -> candle_core::Result<()> {
+        let mut log_std = self.log_std.to_vec1::<f32>()?;
+        if let Some(symmetry) = &self.symmetry {
+            let image = symmetry.policy.actions.clone().unsigned().rows(&log_std);
+            for (own, image) in log_std.iter_mut().zip(image) {
+                *own = 0.5 * (*own + image);
+            }
+        }
+        for log in &mut log_std {
+            *log = log.max(min_std.ln() as f32);
+        }
+        let width = log_std.len();
         self.log_std
-            .set(&self.log_std.detach().maximum(min_std.ln())?)
+            .set(&Tensor::from_vec(log_std, width, &Device::Cpu)?)
     }
 
     /// All variables.
@@ -136,6 +168,103 @@ impl ActorCritic {
         actor
             .map(|(name, var)| Ok((name, var.as_detached_tensor().copy()?)))
             .collect()
+    }
+}
+
+/// The weights of an actor and a critic at some time.
+pub struct Weights<'a> {
+    actor: Layers,
+    critic: Layers,
+    /// Logarithms of the deviations.
+    pub log_std: Vec<f32>,
+    symmetry: Option<&'a Symmetry>,
+}
+
+/// What one of the two networks answered.
+pub struct Answers {
+    /// Mean actions (N × actions), or values (N).
+    pub numbers: Vec<f32>,
+    activations: Activations,
+}
+
+impl Weights<'_> {
+    /// Mean actions for normalised features (N × features; with a symmetry 2N, the second half their images).
+    pub fn means(&self, features: Vec<f32>) -> Answers {
+        let activations = self.actor.forward(features);
+        let numbers = match self.symmetry {
+            Some(symmetry) => symmetry.policy.fold(activations.answers()),
+            None => activations.answers().to_vec(),
+        };
+        Answers {
+            numbers,
+            activations,
+        }
+    }
+
+    /// Values for normalised privileged observations (N × privileged; with a symmetry 2N, the second half their images).
+    pub fn values(&self, privileged: Vec<f32>) -> Answers {
+        let activations = self.critic.forward(privileged);
+        let answers = activations.answers();
+        let numbers = match self.symmetry {
+            Some(_) => {
+                let (seen, mirrored) = answers.split_at(answers.len() / 2);
+                let pairs = seen.iter().zip(mirrored);
+                pairs.map(|(a, b)| 0.5 * (a + b)).collect()
+            }
+            None => answers.to_vec(),
+        };
+        Answers {
+            numbers,
+            activations,
+        }
+    }
+
+    /// Gradients of all variables, in a fixed order, from those of mean actions, values and deviations.
+    pub fn gradient(
+        &self,
+        (means, by_means): (&Answers, Vec<f32>),
+        (values, by_values): (&Answers, Vec<f32>),
+        by_log_std: Vec<f32>,
+    ) -> Gradient {
+        let (by_means, by_values) = match self.symmetry {
+            Some(symmetry) => {
+                let half: Vec<f32> = by_values.iter().map(|g| 0.5 * g).collect();
+                (symmetry.policy.unfold(&by_means), half.repeat(2))
+            }
+            None => (by_means, by_values),
+        };
+        let actor = self.actor.backward(&means.activations, by_means);
+        let critic = self.critic.backward(&values.activations, by_values);
+        let mut parts = BTreeMap::new();
+        for (prefix, layers) in [(ACTOR, actor), (CRITIC, critic)] {
+            for (index, [weight, bias]) in layers.into_iter().enumerate() {
+                parts.insert(format!("{prefix}.{index}.weight"), weight);
+                parts.insert(format!("{prefix}.{index}.bias"), bias);
+            }
+        }
+        parts.insert(LOG_STD.to_owned(), by_log_std);
+        Gradient(parts)
+    }
+}
+
+/// A gradient by the names of the variables.
+pub struct Gradient(pub BTreeMap<String, Vec<f32>>);
+
+impl Gradient {
+    /// Adds another one.
+    pub fn add(&mut self, other: &Self) {
+        for (sum, part) in self.0.values_mut().zip(other.0.values()) {
+            for (sum, part) in sum.iter_mut().zip(part) {
+                *sum += part;
+            }
+        }
+    }
+
+    /// Divides it.
+    pub fn divide(&mut self, by: f32) {
+        for number in self.0.values_mut().flatten() {
+            *number /= by;
+        }
     }
 }
 

@@ -1,80 +1,98 @@
-//! The loss of proximal policy optimisation.
-
-use candle_core::{D, Tensor};
+//! The loss of proximal policy optimisation, and its gradient by hand.
 
 use super::settings::PpoSettings;
 
 /// What was done in a part of a rollout and what came of it, one row a sample.
 pub struct Samples {
     /// Actions taken (N × actions).
-    pub actions: Tensor,
+    pub actions: Vec<f32>,
     /// Log-probabilities of the actions when they were taken (N), up to the constant that [`log_probabilities`] leaves out.
-    pub log_probabilities: Tensor,
+    pub log_probabilities: Vec<f32>,
     /// Advantages, normalised over the rollout (N).
-    pub advantages: Tensor,
+    pub advantages: Vec<f32>,
     /// What the critic should answer (N).
-    pub returns: Tensor,
+    pub returns: Vec<f32>,
 }
 
-/// Losses of some samples, summed over them.
+/// Losses of some samples, summed over them, and the gradient of the loss to descend.
 pub struct Losses {
     /// Clipped surrogate objective, negated.
-    pub policy: Tensor,
+    pub policy: f64,
     /// Squared value error.
-    pub value: Tensor,
-    /// Entropy of the policy, up to a constant.
-    pub entropy: Tensor,
+    pub value: f64,
+    /// The loss to descend: policy and weighted value, less the weighted entropy.
+    pub total: f64,
+    /// Its gradient with respect to the mean actions (N × actions).
+    pub by_means: Vec<f32>,
+    /// Its gradient with respect to the values (N).
+    pub by_values: Vec<f32>,
+    /// Its gradient with respect to the logarithms of the deviations.
+    pub by_log_std: Vec<f32>,
 }
 
 impl Losses {
     /// The losses of `samples`, where the networks answer `means` (N × actions) and `values` (N).
-    ///
-    /// # Errors
-    /// When shapes do not fit.
     pub fn new(
         samples: &Samples,
-        means: &Tensor,
-        log_std: &Tensor,
-        values: &Tensor,
-        clip: f64,
-    ) -> candle_core::Result<Self> {
-        let log_probabilities = log_probabilities(&samples.actions, means, log_std)?;
-        let ratio = (log_probabilities - &samples.log_probabilities)?.exp()?;
-        let clipped = ratio.clamp(1.0 - clip, 1.0 + clip)?;
-        let surrogate = (ratio * &samples.advantages)?
-            .minimum(&(clipped * &samples.advantages)?)?
-            .sum_all()?;
-        let rows = samples.returns.dim(0)? as f64;
-        Ok(Self {
-            policy: surrogate.neg()?,
-            value: (values - &samples.returns)?.sqr()?.sum_all()?,
-            entropy: (log_std.sum_all()? * rows)?,
-        })
-    }
-
-    /// The loss to descend.
-    ///
-    /// # Errors
-    /// When the tensor library fails.
-    pub fn total(&self, settings: &PpoSettings) -> candle_core::Result<Tensor> {
-        let value = (&self.value * settings.value_weight)?;
-        let entropy = (&self.entropy * settings.entropy_weight)?;
-        (&self.policy + value)? - entropy
+        means: &[f32],
+        log_std: &[f32],
+        values: &[f32],
+        settings: &PpoSettings,
+    ) -> Self {
+        let (actions, rows) = (log_std.len(), values.len());
+        let entropy: f64 = log_std.iter().map(|&log| f64::from(log)).sum();
+        let mut losses = Self {
+            policy: 0.0,
+            value: 0.0,
+            total: 0.0,
+            by_means: Vec::with_capacity(means.len()),
+            by_values: Vec::with_capacity(rows),
+            by_log_std: Vec::with_capacity(actions),
+        };
+        let mut by_log_std = vec![-settings.entropy_weight * rows as f64; actions];
+        let now = log_probabilities(&samples.actions, means, log_std);
+        let taken = samples.actions.chunks_exact(actions);
+        for (row, (taken, means)) in taken.zip(means.chunks_exact(actions)).enumerate() {
+            let advantage = f64::from(samples.advantages[row]);
+            let ratio = f64::from(now[row] - samples.log_probabilities[row]).exp();
+            let clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip);
+            losses.policy -= (ratio * advantage).min(clipped * advantage);
+            // Where the clipped one is smaller, nothing moves it.
+            let by_log = match ratio * advantage <= clipped * advantage {
+                true => -ratio * advantage,
+                false => 0.0,
+            };
+            for (joint, (action, mean)) in taken.iter().zip(means).enumerate() {
+                let deviation = f64::from(log_std[joint]).exp();
+                let z = f64::from(action - mean) / deviation;
+                losses.by_means.push((by_log * z / deviation) as f32);
+                by_log_std[joint] += by_log * (z * z - 1.0);
+            }
+            let error = f64::from(values[row]) - f64::from(samples.returns[row]);
+            losses.value += error * error;
+            let by_value = 2.0 * settings.value_weight * error;
+            losses.by_values.push(by_value as f32);
+        }
+        losses.total = losses.policy + settings.value_weight * losses.value
+            - settings.entropy_weight * entropy * rows as f64;
+        let by_log_std = by_log_std.into_iter().map(|sum| sum as f32);
+        losses.by_log_std.extend(by_log_std);
+        losses
     }
 }
 
 /// Log-probability of each row of actions under a Gaussian, without the constant `−n/2 ln 2π`.
-///
-/// # Errors
-/// When shapes do not fit.
-pub fn log_probabilities(
-    actions: &Tensor,
-    means: &Tensor,
-    log_std: &Tensor,
-) -> candle_core::Result<Tensor> {
-    let deviation = (actions - means)?.broadcast_div(&log_std.exp()?)?;
-    let squares = (deviation.sqr()?.sum(D::Minus1)? * -0.5)?;
-    squares.broadcast_sub(&log_std.sum_all()?)
+pub fn log_probabilities(actions: &[f32], means: &[f32], log_std: &[f32]) -> Vec<f32> {
+    let width = log_std.len();
+    let scales: Vec<f32> = log_std.iter().map(|log| (-log).exp()).collect();
+    let constant: f32 = log_std.iter().sum();
+    let rows = actions.chunks_exact(width).zip(means.chunks_exact(width));
+    let row = |(actions, means): (&[f32], &[f32])| {
+        let deviations = actions.iter().zip(means).zip(&scales);
+        let squares = deviations.map(|((action, mean), scale)| ((action - mean) * scale).powi(2));
+        -0.5 * squares.sum::<f32>() - constant
+    };
+    rows.map(row).collect()
 }
 
 /// Sum over rows of the Kullback–Leibler divergence of the Gaussian (`means`, `log_std`) from (`old_means`, `old_log_std`).
@@ -122,96 +140,95 @@ pub fn adapted_learning_rate(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use candle_core::{Device, Var};
 
-    const ACTIONS: [f64; 6] = [0.3, -0.2, 1.1, 0.4, -0.6, 0.1];
-    const MEANS: [f64; 6] = [0.1, -0.1, 0.9, 0.5, 0.2, 0.3];
-    const LOG_STD: [f64; 2] = [-0.5, -0.2];
+    const ACTIONS: [f32; 6] = [0.3, -0.2, 1.1, 0.4, -0.6, 0.1];
+    const MEANS: [f32; 6] = [0.1, -0.1, 0.9, 0.5, 0.2, 0.3];
+    const LOG_STD: [f32; 2] = [-0.5, -0.2];
     /// Log-ratios that are inside the clip, beyond it upwards, beyond it downwards.
-    const LOG_RATIOS: [f64; 3] = [0.05, 0.4, -0.4];
-    const RETURNS: [f64; 3] = [1.0, -2.0, 0.5];
-    const VALUES: [f64; 3] = [0.5, -1.0, 0.7];
+    const LOG_RATIOS: [f32; 3] = [0.05, 0.4, -0.4];
+    const RETURNS: [f32; 3] = [1.0, -2.0, 0.5];
+    const VALUES: [f32; 3] = [0.5, -1.0, 0.7];
 
-    fn density(row: usize) -> f64 {
-        let term = |j: usize| {
-            let z = (ACTIONS[2 * row + j] - MEANS[2 * row + j]) / LOG_STD[j].exp();
-            -0.5 * z * z - LOG_STD[j]
-        };
-        term(0) + term(1)
-    }
-
-    struct Case {
-        samples: Samples,
-        means: Var,
-        log_std: Var,
-        values: Var,
-    }
-
-    fn case(advantages: [f64; 3]) -> Case {
-        let tensor = |values: &[f64]| Tensor::new(values, &Device::Cpu).unwrap();
-        let rows = |values: &[f64]| tensor(values).reshape((3, 2)).unwrap();
-        let old: Vec<f64> = (0..3).map(|row| density(row) - LOG_RATIOS[row]).collect();
-        Case {
-            samples: Samples {
-                actions: rows(&ACTIONS),
-                log_probabilities: tensor(&old),
-                advantages: tensor(&advantages),
-                returns: tensor(&RETURNS),
-            },
-            means: Var::from_tensor(&rows(&MEANS)).unwrap(),
-            log_std: Var::from_tensor(&tensor(&LOG_STD)).unwrap(),
-            values: Var::from_tensor(&tensor(&VALUES)).unwrap(),
+    fn samples(advantages: [f32; 3]) -> Samples {
+        let now = log_probabilities(&ACTIONS, &MEANS, &LOG_STD);
+        let old = now.iter().zip(LOG_RATIOS).map(|(now, ratio)| now - ratio);
+        Samples {
+            actions: ACTIONS.to_vec(),
+            log_probabilities: old.collect(),
+            advantages: advantages.to_vec(),
+            returns: RETURNS.to_vec(),
         }
     }
 
-    fn losses(case: &Case) -> Losses {
-        Losses::new(&case.samples, &case.means, &case.log_std, &case.values, 0.2).unwrap()
-    }
-
-    fn scalar(tensor: &Tensor) -> f64 {
-        tensor.to_scalar().unwrap()
+    #[test]
+    fn a_density_is_the_gaussians() {
+        for (row, density) in log_probabilities(&ACTIONS, &MEANS, &LOG_STD)
+            .iter()
+            .enumerate()
+        {
+            let term = |j: usize| {
+                let z = (ACTIONS[2 * row + j] - MEANS[2 * row + j]) / LOG_STD[j].exp();
+                -0.5 * z * z - LOG_STD[j]
+            };
+            assert!((density - term(0) - term(1)).abs() < 1e-6);
+        }
     }
 
     #[test]
     fn the_surrogate_is_clipped_where_clipping_costs() {
-        let ratios = LOG_RATIOS.map(f64::exp);
+        let ratios = LOG_RATIOS.map(|log| f64::from(log).exp());
         for (advantages, expected) in [
             ([2.0, 2.0, 2.0], 2.0 * (ratios[0] + 1.2 + ratios[2])),
             ([-1.0, -1.0, -1.0], -(ratios[0] + ratios[1] + 0.8)),
         ] {
-            let losses = losses(&case(advantages));
-            assert!((scalar(&losses.policy) + expected).abs() < 1e-9);
-            assert!((scalar(&losses.value) - (0.25 + 1.0 + 0.04)).abs() < 1e-9);
-            assert!((scalar(&losses.entropy) - 3.0 * -0.7).abs() < 1e-9);
+            let settings = PpoSettings {
+                entropy_weight: 0.5,
+                ..PpoSettings::default()
+            };
+            let samples = samples(advantages);
+            let losses = Losses::new(&samples, &MEANS, &LOG_STD, &VALUES, &settings);
+            assert!((losses.policy + expected).abs() < 1e-5);
+            assert!((losses.value - (0.25 + 1.0 + 0.04)).abs() < 1e-5);
+            let total = losses.policy + losses.value - 0.5 * 3.0 * -0.7;
+            assert!((losses.total - total).abs() < 1e-5);
         }
     }
 
     #[test]
     fn gradients_equal_finite_differences() {
+        const STEP: f32 = 1e-2;
         let settings = PpoSettings {
             entropy_weight: 0.3,
+            value_weight: 0.7,
             ..PpoSettings::default()
         };
-        let case = case([1.5, -0.7, 0.4]);
-        let total = || losses(&case).total(&settings).unwrap();
-        let grads = total().backward().unwrap();
-        for var in [&case.means, &case.log_std, &case.values] {
-            let gradient = grads.get(var).unwrap().flatten_all().unwrap();
-            let gradient = gradient.to_vec1::<f64>().unwrap();
-            let start = var.flatten_all().unwrap().to_vec1::<f64>().unwrap();
-            for (i, gradient) in gradient.into_iter().enumerate() {
-                let at = |step: f64| {
-                    let mut values = start.clone();
+        let samples = samples([1.5, -0.7, 0.4]);
+        let losses = |means: &[f32], log_std: &[f32], values: &[f32]| {
+            Losses::new(&samples, means, log_std, values, &settings)
+        };
+        let here = losses(&MEANS, &LOG_STD, &VALUES);
+        let check = |start: &[f32], gradient: &[f32], total: &dyn Fn(&[f32]) -> f64| {
+            assert_eq!(start.len(), gradient.len());
+            for (i, gradient) in gradient.iter().enumerate() {
+                let at = |step: f32| {
+                    let mut values = start.to_vec();
                     values[i] += step;
-                    var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu).unwrap())
-                        .unwrap();
-                    scalar(&total())
+                    total(&values)
                 };
-                let slope = (at(1e-6) - at(-1e-6)) / 2e-6;
-                at(0.0);
-                assert!((slope - gradient).abs() < 1e-6, "{slope} {gradient}");
+                let slope = (at(STEP) - at(-STEP)) / f64::from(2.0 * STEP);
+                let error = (slope - f64::from(*gradient)).abs();
+                assert!(error < 2e-3 * (1.0 + slope.abs()), "{slope} {gradient}");
             }
-        }
+        };
+        check(&MEANS, &here.by_means, &|means| {
+            losses(means, &LOG_STD, &VALUES).total
+        });
+        check(&LOG_STD, &here.by_log_std, &|log| {
+            losses(&MEANS, log, &VALUES).total
+        });
+        check(&VALUES, &here.by_values, &|values| {
+            losses(&MEANS, &LOG_STD, values).total
+        });
     }
 
     #[test]

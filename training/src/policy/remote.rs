@@ -116,6 +116,7 @@ impl RolloutSource for RemoteSource {
             horizon: u32::try_from(horizon)?,
             randomization: snapshot.randomization,
             difficulty: snapshot.difficulty,
+            clip_weights: snapshot.clip_weights.clone(),
         };
         let environments = self.environments;
         let parts = self.each(|server| server.collect(request.clone()))?;
@@ -405,8 +406,8 @@ fn statistics(parts: &[Part], rollout: &Rollout) -> Result<RolloutStatistics> {
         );
         for (row, episode) in rows.into_iter().zip(&part.finished.episodes) {
             let end = end_reason(episode.end())?;
-            let length = episode.length;
-            episodes.push((row, Episode { length, end }));
+            let (length, clip) = (episode.length, episode.clip);
+            episodes.push((row, Episode { length, end, clip }));
         }
     }
     episodes.sort_by_key(|(row, _)| *row);

@@ -20,6 +20,8 @@ pub struct PolicySnapshot {
     pub randomization: f64,
     /// Largest amplitude of goals of episodes that start now.
     pub difficulty: f64,
+    /// How often each clip of the library is drawn from now on, relative to its class and length.
+    pub clip_weights: Vec<f32>,
 }
 
 /// A rollout and how long parts of it took.
@@ -87,6 +89,7 @@ impl RolloutSource for LocalSource {
     fn collect(&mut self, snapshot: &PolicySnapshot, horizon: usize) -> Result<Collected> {
         self.collector
             .set_curriculum(snapshot.randomization, snapshot.difficulty as f32);
+        self.collector.set_clip_weights(&snapshot.clip_weights);
         let rollout = self
             .collector
             .collect(&snapshot.policy, &snapshot.log_std, horizon)?;

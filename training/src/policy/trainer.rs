@@ -8,13 +8,14 @@ use emp_models::{
     CheckpointMetadata,
     checkpoint::{self, Tensors},
     mlp::shipped_tensors,
-    policy::{self, NETWORK_PREFIX, Policy, PolicyConfig},
+    policy::{self, NETWORK_PREFIX, Policy, PolicyConfig, PolicyMirror},
 };
 use emp_motion::atomic;
 use emp_robot::Robot;
 use emp_sim::{
     End, Rollout,
     environment::{EndReason, PrivilegedLayout, REWARD_NAMES},
+    goals::GoalLibrary,
 };
 use serde::{Deserialize, Serialize};
 
@@ -22,10 +23,10 @@ use super::{
     curriculum::{Curriculum, Episode},
     judge::{Judge, Verdict},
     learner::{self, Learner, UpdateStatistics},
-    network::Widths,
-    settings::{Settings, Symmetry},
+    network::{Symmetry, Widths},
+    sampler::Sampler,
+    settings::Settings,
     source::{PolicySnapshot, RolloutSource},
-    symmetry::FeatureMirror,
 };
 use crate::{
     log::CsvLog,
@@ -65,6 +66,9 @@ pub struct Trainer {
     config: PolicyConfig,
     learner: Learner,
     curriculum: Curriculum,
+    sampler: Sampler,
+    /// The goals, which the sampler's weights are for.
+    library: Arc<GoalLibrary>,
     /// Environment steps learnt from.
     steps: u64,
     /// The best score of a judged policy.
@@ -120,25 +124,39 @@ struct Saved {
 }
 
 impl Trainer {
-    /// Starts with random weights.
+    /// Starts with random weights, on goals from `library`. The policy is symmetric where the robot is.
     ///
     /// # Errors
-    /// When symmetry is asked for and the robot has no mirror image, or the system gives no threads.
-    pub fn new(robot: Arc<Robot>, settings: Settings, threads: usize) -> Result<Self> {
-        let config = PolicyConfig::new(&robot, settings.ppo.actor_hidden.clone());
+    /// When the system gives no threads.
+    pub fn new(
+        robot: Arc<Robot>,
+        settings: Settings,
+        library: Arc<GoalLibrary>,
+        threads: usize,
+    ) -> Result<Self> {
+        let mut config = PolicyConfig::new(&robot, settings.ppo.actor_hidden.clone());
+        config.observation = config
+            .observation
+            .with_heading_periods(settings.environment.heading_periods);
+        let layout = PrivilegedLayout::new(&config.observation);
         let widths = Widths {
             features: config.features(),
-            privileged: PrivilegedLayout::new(&config.observation).width(),
+            privileged: layout.width(),
             actions: config.observation.last_action().len(),
         };
-        let mirror = match settings.ppo.symmetry {
-            Symmetry::None => None,
-            _ => Some(FeatureMirror::new(&robot, &config)?),
+        let symmetry = match PolicyMirror::new(&robot, &config)? {
+            Some(policy) => Some(Symmetry {
+                policy,
+                privileged: layout.mirror(&robot, &config.observation)?,
+            }),
+            None => None,
         };
-        let ppo = settings.ppo.clone();
+        let (ppo, clips) = (settings.ppo.clone(), library.clips().len());
         Ok(Self {
-            learner: Learner::new(widths, ppo, mirror, settings.seed, threads)?,
+            learner: Learner::new(widths, ppo, symmetry, settings.seed, threads)?,
             curriculum: Curriculum::new(settings.curriculum),
+            sampler: Sampler::new(settings.sampler, clips),
+            library,
             steps: 0,
             best_score: None,
             times: Times::default(),
@@ -148,39 +166,48 @@ impl Trainer {
         })
     }
 
-    /// Continues from a checkpoint of this run, the environments of `source` too.
+    /// Continues from a checkpoint of this run, the environments of `source` too. Where the settings, or the goals, may be
+    /// others than they were, the environments and the counts of falls start anew, and so does the best score.
     ///
     /// # Errors
-    /// When the checkpoint is damaged, or its run had other settings or another robot.
+    /// When the checkpoint is damaged, its run had another robot, or other settings or goals unasked.
     pub fn resume(
         robot: Arc<Robot>,
         settings: Settings,
+        library: Arc<GoalLibrary>,
         threads: usize,
         path: &Path,
         source: &mut dyn RolloutSource,
+        change_settings: bool,
     ) -> Result<Self> {
         let (metadata, mut tensors) = checkpoint::load(path)?;
         metadata.check(path, &run_metadata(&robot))?;
         let saved: Saved = serde_json::from_value(metadata.training)
             .with_context(|| format!("{}: metadata field training", path.display()))?;
         ensure!(
-            saved.settings == settings,
-            "{}: the run was started with {:?}, not with {settings:?}",
+            change_settings || saved.settings == settings,
+            "{}: the run was started with {:?}, not with {settings:?}; --change-settings lets it go on with these",
             path.display(),
             saved.settings
         );
-        let mut trainer = Self::new(robot, settings, threads)?;
+        let mut trainer = Self::new(robot, settings, library, threads)?;
         let environments = tensors
             .remove(ENVIRONMENTS)
             .with_context(|| format!("{}: no tensor `{ENVIRONMENTS}`", path.display()))?;
-        source.restore(&environments.to_vec1::<u8>()?)?;
+        let file = || path.display().to_string();
         trainer
             .learner
             .restore(&tensors, saved.learner)
-            .with_context(|| path.display().to_string())?;
-        trainer.curriculum = saved.curriculum;
+            .with_context(file)?;
         trainer.steps = saved.steps;
-        trainer.best_score = saved.best_score;
+        if change_settings {
+            trainer.curriculum.resume_from(&saved.curriculum);
+        } else {
+            source.restore(&environments.to_vec1::<u8>()?)?;
+            trainer.sampler.restore(&tensors).with_context(file)?;
+            trainer.curriculum = saved.curriculum;
+            trainer.best_score = saved.best_score;
+        }
         Ok(trainer)
     }
 
@@ -256,6 +283,7 @@ impl Trainer {
     /// When the file cannot be written.
     pub fn save_run(&self, path: &Path, source: &mut dyn RolloutSource) -> Result<()> {
         let mut tensors = self.learner.state()?;
+        self.sampler.save(&mut tensors)?;
         let environments = source.snapshot()?;
         let bytes = environments.len();
         tensors.insert(
@@ -291,6 +319,7 @@ impl Trainer {
             log_std: self.learner.log_std()?,
             randomization: self.curriculum.randomization(),
             difficulty: self.curriculum.difficulty(),
+            clip_weights: self.sampler.weights(),
         })
     }
 
@@ -306,10 +335,23 @@ impl Trainer {
     /// Collects a rollout and learns from it.
     fn step(&mut self, source: &mut dyn RolloutSource) -> Result<Step> {
         let start = Instant::now();
-        let collected = source.collect(&self.snapshot()?, self.settings.horizon)?;
+        let snapshot = self.snapshot()?;
+        let collected = source.collect(&snapshot, self.settings.horizon)?;
         let collecting = start.elapsed().as_secs_f64();
         let rollout = collected.rollout;
         let update = self.learner.update(&rollout)?;
+        let fell = |end: EndReason| matches!(end, EndReason::Tilted | EndReason::Sank);
+        let ended = rollout.statistics.episodes.iter();
+        self.sampler.update(
+            &self
+                .library
+                .weighted(&snapshot.clip_weights)
+                .probabilities(),
+            rollout.rewards.len(),
+            ended
+                .filter(|episode| fell(episode.end))
+                .map(|episode| episode.clip as usize),
+        );
         let longest = self.settings.environment.episode_frames as f64;
         let episodes = rollout.statistics.episodes.iter();
         self.curriculum.update(episodes.map(|episode| {

@@ -27,10 +27,10 @@ pub struct ArmMotion {
 }
 
 impl ArmMotion {
-    /// Measures an arm; none where the clip is shorter than a second.
+    /// Measures an arm; none where the clip is shorter than a second, or too long to be sampled anew.
     #[must_use]
     pub fn of(clip: &Clip, side: Side) -> Option<Self> {
-        let clip = clip.resampled(RATE);
+        let clip = clip.resampled(RATE).ok()?;
         if clip.duration() < SHORTEST {
             return None;
         }

@@ -17,7 +17,10 @@ use emp_sim::{
 };
 use serde::Serialize;
 
-use crate::{retargeter::data, sets};
+use crate::{
+    retargeter::data,
+    sets::{self, MotionSet},
+};
 
 /// Frames of a clip, as in the paper.
 const FRAMES: usize = 200;
@@ -155,11 +158,12 @@ impl Judge {
         threads: usize,
     ) -> Result<Self> {
         let robot = Arc::clone(retargeter.robot());
+        MotionSet::Development.check(folders)?;
         let recorded = data::load_clips(folders)?;
         let skills: Vec<Clip> = skills::library(SEED, procedural)
             .iter()
             .map(|clip| clip.resampled(data::RATE))
-            .collect();
+            .collect::<Result<_, _>>()?;
         let windows = recorded.iter().flat_map(windows_of);
         let first = skills
             .iter()

@@ -227,9 +227,10 @@ impl<K: Kind> Driver<K> {
         }
     }
 
-    /// Waits for the next attempt. With `LATEST` whatever is unanswered or sent meanwhile is dropped: it would be stale.
+    /// Waits for the next attempt. Whatever would be stale, unanswered or sent meanwhile, is dropped: all with `LATEST`, and a robot's
+    /// states in any case.
     async fn wait(&mut self, until: Instant) -> Result<(), End> {
-        let latest = self.config.delivery() == Delivery::Latest;
+        let latest = !K::RESENDS || self.config.delivery() == Delivery::Latest;
         loop {
             while latest && let Some(frame) = self.window.pop_front() {
                 self.tell(lost(frame.number)).await?;

@@ -9,7 +9,7 @@ use emp_client::{
     Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult, EvaluationStarted,
     GoalStatistics, MassRange, Metric, ProceduralClips, Push, Randomization, Spread,
 };
-use emp_motion::atomic;
+use emp_motion::atomic::AtomicFile;
 use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
@@ -409,8 +409,8 @@ fn end(episode: &EpisodeResult) -> &'static str {
 
 /// Writes one row an episode to a temporary name beside `path`, which then appears whole.
 fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
-    let file = atomic::temporary(path)?;
-    let mut csv = Writer::from_writer(file.reopen()?);
+    let file = AtomicFile::create(path)?;
+    let mut csv = Writer::from_writer(file.handle()?);
     csv.write_record([
         "episode",
         "clip",
@@ -459,7 +459,7 @@ fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
         csv.write_record(row)?;
     }
     csv.flush()?;
-    Ok(atomic::persist(file, path)?)
+    Ok(file.finish()?)
 }
 
 #[cfg(test)]

@@ -28,6 +28,10 @@ pub(crate) trait Kind: Clone + Send + Sync + 'static {
     /// What answers a frame.
     type Result;
 
+    /// Whether a frame without an answer is worth sending again on another connection: a person's motion, not what a robot
+    /// measured a while ago.
+    const RESENDS: bool;
+
     /// The first message.
     fn first(&self) -> Self::Request;
 
@@ -73,6 +77,8 @@ impl Kind for StreamConfig {
     type Request = StreamRetargetRequest;
     type Response = StreamRetargetResponse;
     type Result = RetargetResult;
+
+    const RESENDS: bool = true;
 
     fn first(&self) -> StreamRetargetRequest {
         let message = Some(stream_retarget_request::Message::Config(self.message()));
@@ -128,6 +134,8 @@ impl Kind for PolicyConfig {
     type Response = StreamPolicyResponse;
     type Result = PolicyResult;
 
+    const RESENDS: bool = false;
+
     fn first(&self) -> StreamPolicyRequest {
         let message = Some(stream_policy_request::Message::Config(self.message()));
         StreamPolicyRequest { message }
@@ -178,6 +186,8 @@ impl Kind for FilterConfig {
     type Request = StreamFilterGoalRequest;
     type Response = StreamFilterGoalResponse;
     type Result = FilterResult;
+
+    const RESENDS: bool = false;
 
     fn first(&self) -> StreamFilterGoalRequest {
         let message = Some(stream_filter_goal_request::Message::Config(self.message()));

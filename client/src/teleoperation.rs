@@ -207,6 +207,8 @@ impl Kind for RobotEnd {
     type Response = TeleoperateResponse;
     type Result = TeleoperatedFrame;
 
+    const RESENDS: bool = false;
+
     fn first(&self) -> TeleoperateRequest {
         self.config.request(self.role)
     }

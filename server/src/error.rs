@@ -211,7 +211,8 @@ impl ServiceError {
             Self::Overloaded { retry, .. } => {
                 details.set_retry_info(Some(*retry));
             }
-            Self::ModelUnavailable | Self::ShuttingDown => {
+            // A server that shuts down does not say when: another may be there already.
+            Self::ModelUnavailable => {
                 details.set_retry_info(Some(UNAVAILABLE_RETRY));
             }
             _ => {}

@@ -177,6 +177,9 @@ fn read_observation(
     Ok(period)
 }
 
+/// Largest action of a policy, of whatever sign: far beyond what it has learnt to answer.
+const LARGEST_ACTION: f32 = 100.0;
+
 /// The last action: all zero where there is none.
 pub(crate) fn read_last_action(
     path: &str,
@@ -188,5 +191,14 @@ pub(crate) fn read_last_action(
         return Ok(vec![0.0; legs]);
     }
     check::numbers(path, action, legs, "numbers")?;
-    Ok(action.to_vec())
+    match action.iter().position(|value| value.abs() > LARGEST_ACTION) {
+        Some(index) => Err(FieldError::new(
+            format!("{path}[{index}]"),
+            format!(
+                "{}; expected {} to {LARGEST_ACTION}",
+                action[index], -LARGEST_ACTION
+            ),
+        )),
+        None => Ok(action.to_vec()),
+    }
 }

@@ -234,7 +234,7 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
 async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let server = TestServer::start_with(weights.path(), |settings| {
-        settings.rollouts.max_frames = 500.try_into().expect("not zero");
+        settings.rollouts.max_frames = 1_500.try_into().expect("not zero");
     })?;
     let client = Client::connect(&server.url()).await?;
     let with = |change: &dyn Fn(&mut EvaluateConfig)| {
@@ -335,6 +335,13 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
             poses,
         })
     };
+    let at_rate = |fps, frames| {
+        Message::Clip(MotionClip {
+            name: "motion".to_owned(),
+            fps,
+            poses: vec![good(); frames],
+        })
+    };
     let bad = || {
         let mut pose = good();
         pose.left_elbow = None;
@@ -371,7 +378,7 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
         ),
         (
             "clip.poses",
-            vec![Message::Config(config()), clip(vec![good(); 501])],
+            vec![Message::Config(config()), clip(vec![good(); 1_501])],
         ),
         (
             "clip.poses",
@@ -396,6 +403,27 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
                     ..MotionClip::default()
                 }),
             ],
+        ),
+        (
+            "clip.name",
+            vec![
+                Message::Config(config()),
+                Message::Clip(MotionClip {
+                    name: "x".repeat(129),
+                    fps: 50.0,
+                    poses: vec![good()],
+                }),
+            ],
+        ),
+        // What two poses become counts, not that they are two.
+        (
+            "clip.poses",
+            vec![Message::Config(config()), at_rate(1.0, 40)],
+        ),
+        ("clip.fps", vec![Message::Config(config()), at_rate(1e-9, 2)]),
+        (
+            "clip.fps",
+            vec![Message::Config(config()), at_rate(f64::NAN, 2)],
         ),
     ];
     let mut raw = RolloutServiceClient::connect(server.url()).await?;

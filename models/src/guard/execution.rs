@@ -113,7 +113,8 @@ impl ExecutionGuard {
         let mut limited = Vec::new();
         for (index, ((goal, last), step)) in joints.enumerate() {
             let wanted = *goal;
-            *goal = wanted.clamp(last - step, last + step);
+            // A goal that is no number stays where the joint is.
+            *goal = wanted.max(last - step).min(last + step);
             if *goal != wanted {
                 limited.push(index);
             }

@@ -34,6 +34,8 @@ const MAX_ENVIRONMENTS: u32 = 16_384;
 const MAX_ROWS: u64 = 262_144;
 /// Most goal clips of a library.
 const MAX_CLIPS: u32 = 1_000_000;
+/// Most numbers of a request's features: 2 GiB.
+const MAX_NUMBERS: u64 = 1 << 29;
 /// Largest scale of randomisation and goals.
 const MAX_SCALE: f64 = 10.0;
 /// Most often that a clip may be drawn, relative to the others.
@@ -162,7 +164,8 @@ async fn read_plan(
         )
     })?;
     let number = read::within("config.clips", config.clips, 0..=MAX_CLIPS)?;
-    let which = motion::read_procedural(config.procedural.as_ref())?;
+    let mut budget = context.budget(&robot);
+    let which = motion::read_procedural(config.procedural.as_ref(), &mut budget)?;
     let procedural = match which.0 {
         0 if number == 0 => {
             let description = "0, and no procedural motions; a library needs clips";
@@ -176,7 +179,7 @@ async fn read_plan(
     };
     let place = context.jobs.enter()?;
     let plan = Plan {
-        clips: read_clips(context, inbound, &robot, number).await?,
+        clips: read_clips(budget, inbound, &robot, number).await?,
         robot,
         environments: first..end,
         seed: config.seed,
@@ -202,13 +205,12 @@ fn read_environment(
 }
 
 async fn read_clips(
-    context: &RolloutContext,
+    mut budget: read::Budget,
     inbound: &mut Streaming<CollectRolloutsRequest>,
     robot: &Robot,
     number: u32,
 ) -> Result<Vec<GoalClip>, ServiceError> {
     let mut clips = Vec::new();
-    let mut budget = context.budget();
     for _ in 0..number {
         let clip = match read::message(inbound).await?.and_then(|next| next.message) {
             Some(Request::Clip(clip)) => clip,
@@ -228,7 +230,8 @@ async fn read_clips(
             return Err(FieldError::new("clip.goals", description).into());
         }
         let rows: Vec<&[f32]> = clip.goals.chunks_exact(joints).collect();
-        budget.spend("clip.goals", rows.len())?;
+        // Even one without goals takes room.
+        budget.spend("clip.goals", rows.len() + 1)?;
         let name = read::name("clip.name", clip.name)?;
         let made = GoalClip::new(robot, name, source, &rows)
             .map_err(|error| FieldError::new("clip.goals", error.to_string()))?;
@@ -306,6 +309,8 @@ impl Learner<'_> {
             let field = format!("collect.clip_weights[{index}]");
             read::within(&field, *weight, f32::MIN_POSITIVE..=MAX_CLIP_WEIGHT)?;
         }
+        let numbers = u64::from(horizon) * environments * policy.config().features() as u64;
+        read::within("collect.policy", numbers, 0..=MAX_NUMBERS)?;
         self.collector
             .set_curriculum(randomization, difficulty as f32);
         self.collector.set_clip_weights(clip_weights);

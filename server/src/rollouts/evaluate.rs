@@ -38,8 +38,8 @@ const CLIP_FRAMES: usize = 200;
 const PUSH_INTERVAL: f64 = 5.0;
 /// Most frames of an evaluation clip, and most episodes.
 const MAX_COUNT: u32 = 100_000;
-/// Most frames a second of a motion.
-const MAX_FPS: f64 = 1_000.0;
+/// Least and most frames a second of a motion.
+const FPS: [f64; 2] = [1.0, 1_000.0];
 /// Largest mass in a hand, kilograms.
 const MAX_LOAD: f64 = 20.0;
 
@@ -192,11 +192,12 @@ async fn read_plan(
     let retargeter = context.catalog.retargeter_for(&config.robot, "", "")?;
     let network = motion::network(retargeter)?;
     let controller = read_controller(&config.controller, policy)?;
-    let procedural = motion::read_procedural(config.procedural.as_ref())?;
+    let mut budget = context.budget(&policy.robot);
+    let procedural = motion::read_procedural(config.procedural.as_ref(), &mut budget)?;
     let settings = read_settings(&config, &policy.robot)?;
     let clip_frames = read::within("config.clip_frames", config.clip_frames, 0..=MAX_COUNT)?;
     let place = context.jobs.enter()?;
-    let motions = read_motions(inbound, context.budget()).await?;
+    let motions = read_motions(inbound, budget).await?;
     if motions.is_empty() && procedural.0 == 0 {
         let description = "no motion was sent, and no procedural motion asked for";
         return Err(FieldError::new("config.procedural", description).into());
@@ -311,9 +312,11 @@ fn read_clip(clip: MotionClip, budget: &mut Budget) -> Result<Clip, FieldError> 
     let MotionClip { name, fps, poses } = clip;
     let mut clip = Clip {
         name: read::name("clip.name", name)?,
-        fps: read::within("clip.fps", fps, f64::MIN_POSITIVE..=MAX_FPS)?,
+        fps: read::within("clip.fps", fps, FPS[0]..=FPS[1])?,
         frames: Vec::new(),
     };
+    // Even one without poses takes room.
+    budget.spend("clip.poses", 1)?;
     read_poses("clip.poses", &poses, &mut clip, budget)?;
     Ok(clip)
 }
@@ -324,7 +327,13 @@ fn read_poses(
     clip: &mut Clip,
     budget: &mut Budget,
 ) -> Result<(), FieldError> {
-    budget.spend(field, poses.len())?;
+    // What they will become counts, before it is made.
+    let becomes = |frames: usize| {
+        let frames_at_rate = (frames as f64 / clip.fps * budget.control_rate).ceil();
+        (frames_at_rate as usize).max(frames)
+    };
+    let (before, after) = (clip.frames.len(), clip.frames.len() + poses.len());
+    budget.spend(field, becomes(after) - becomes(before))?;
     for (index, pose) in poses.iter().enumerate() {
         let path = format!("{field}[{index}]");
         clip.frames.push(pose::read_at(&path, pose)?);

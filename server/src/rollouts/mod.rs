@@ -48,8 +48,8 @@ impl RolloutContext {
         }
     }
 
-    fn budget(&self) -> read::Budget {
-        read::Budget::new(self.max_frames)
+    fn budget(&self, robot: &emp_robot::Robot) -> read::Budget {
+        read::Budget::new(self.max_frames, robot.control_rate_hz())
     }
 }
 

@@ -15,15 +15,22 @@ use crate::{
 
 /// Most procedural clips of a job.
 const MAX_PROCEDURAL: u32 = 10_000;
+/// Frames of a procedural clip at most.
+const PROCEDURAL_FRAMES: usize = 1_000;
 /// Clips that a thread retargets between two questions whether to stop.
 const BLOCK: usize = 4;
 
-/// Reads how many procedural clips are asked for, and their seed.
+/// Reads how many procedural clips are asked for, and their seed; their frames come out of the budget.
 pub(super) fn read_procedural(
     procedural: Option<&ProceduralClips>,
+    budget: &mut read::Budget,
 ) -> Result<(usize, u64), FieldError> {
     let ProceduralClips { count, seed } = procedural.copied().unwrap_or_default();
     let count = read::within("config.procedural.count", count, 0..=MAX_PROCEDURAL)?;
+    budget.spend(
+        "config.procedural.count",
+        count as usize * PROCEDURAL_FRAMES,
+    )?;
     Ok((count as usize, seed))
 }
 

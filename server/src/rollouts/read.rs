@@ -29,12 +29,20 @@ pub(super) fn within<T: PartialOrd + Display + Copy>(
     ))
 }
 
+/// Longest name of a clip, bytes.
+const LONGEST_NAME: usize = 128;
+
 /// A clip's name.
 pub(super) fn name(field: &str, name: String) -> Result<String, FieldError> {
-    if name.is_empty() {
-        return Err(FieldError::new(field, "it is missing"));
+    match name.len() {
+        0 => Err(FieldError::new(field, "it is missing")),
+        // It stands in every episode's report.
+        length if length > LONGEST_NAME => {
+            let description = format!("{length} bytes; expected at most {LONGEST_NAME}");
+            Err(FieldError::new(field, description))
+        }
+        _ => Ok(name),
     }
-    Ok(name)
 }
 
 /// Where a goal clip comes from, off the wire.
@@ -46,15 +54,21 @@ pub(super) fn source(field: &str, number: i32) -> Result<Source, FieldError> {
     }
 }
 
-/// How many frames a call may still send.
+/// How many frames, at the robot's control rate, a call may still send or have made.
 pub(super) struct Budget {
+    /// Rate of the frames that count, Hz.
+    pub(super) control_rate: f64,
     limit: usize,
     left: usize,
 }
 
 impl Budget {
-    pub(super) fn new(limit: usize) -> Self {
-        Self { limit, left: limit }
+    pub(super) fn new(limit: usize, control_rate: f64) -> Self {
+        Self {
+            control_rate,
+            limit,
+            left: limit,
+        }
     }
 
     /// Takes `frames` that `field` brought.

@@ -3,8 +3,8 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use csv::Writer;
 use crate::{MotionError, atomic::AtomicFile};
+use csv::Writer;
 
 /// Writes rows to a temporary name beside the target, which appears, whole, with [`finish`](Self::finish).
 #[derive(Debug)]

@@ -420,7 +420,10 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
             "clip.poses",
             vec![Message::Config(config()), at_rate(1.0, 40)],
         ),
-        ("clip.fps", vec![Message::Config(config()), at_rate(1e-9, 2)]),
+        (
+            "clip.fps",
+            vec![Message::Config(config()), at_rate(1e-9, 2)],
+        ),
         (
             "clip.fps",
             vec![Message::Config(config()), at_rate(f64::NAN, 2)],

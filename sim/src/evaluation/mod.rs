@@ -192,7 +192,7 @@ pub fn evaluate_observed(
         controller,
         clips: &clips,
         setting: Setting {
-            kind: Kind::new(Arc::clone(robot)),
+            kind: Kind::new(Arc::clone(robot), controller.policy().config().observation),
             seed: settings.seed,
             pushes: settings.pushes(&randomization),
             randomization,

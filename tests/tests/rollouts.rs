@@ -592,6 +592,9 @@ fn collect_config(environments: std::ops::Range<u64>) -> CollectRolloutsConfig {
     }
 }
 
+/// How often the library's first two clips are drawn.
+const CLIP_WEIGHTS: [f32; 2] = [0.5, 2.0];
+
 fn collect_request(policy: &Policy, iteration: u64) -> anyhow::Result<CollectRequest> {
     Ok(CollectRequest {
         iteration,
@@ -600,7 +603,7 @@ fn collect_request(policy: &Policy, iteration: u64) -> anyhow::Result<CollectReq
         horizon: 24,
         randomization: 0.5,
         difficulty: 0.8,
-        clip_weights: vec![0.5, 2.0],
+        clip_weights: CLIP_WEIGHTS.to_vec(),
     })
 }
 
@@ -671,6 +674,7 @@ async fn rollouts_are_those_of_this_process_whoever_collects_them() -> anyhow::R
                 assert_eq!(snapshot, here.snapshot()?);
             }
             here.set_curriculum(0.5, 0.8);
+            here.set_clip_weights(&CLIP_WEIGHTS);
             let expected = here.collect(&policy, &[-1.0; 12], 24)?;
             let request = collect_request(&policy, iteration)?;
             let rollout = within("a rollout", learner.collect(request)).await??;
@@ -679,6 +683,7 @@ async fn rollouts_are_those_of_this_process_whoever_collects_them() -> anyhow::R
         here.restore(&snapshot)?;
         within("a restored snapshot", learner.restore(&snapshot)).await??;
         here.set_curriculum(0.5, 0.8);
+        here.set_clip_weights(&CLIP_WEIGHTS);
         let expected = here.collect(&policy, &[-1.0; 12], 24)?;
         let request = collect_request(&policy, 9)?;
         let rollout = within("a rollout", learner.collect(request)).await??;

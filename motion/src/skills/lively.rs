@@ -71,7 +71,7 @@ pub(super) fn box_combination(time: &mut Timeline, how: &Performance, rng: &mut 
     for _ in 0..how.repeats(rng, 5) {
         let punches = if how.brief { 2 } else { rng.random_range(2..5) };
         for _ in 0..punches {
-            let peak = rng.random_range(4.5..6.0) * how.tempo;
+            let peak = rng.random_range(4.5..6.0);
             let follow = rng.random_range(0.3..0.6) * if side == Side::Left { -1.0 } else { 1.0 };
             match rng.random_range(0..4) {
                 0 => {

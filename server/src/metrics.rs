@@ -8,6 +8,7 @@ use std::{
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
+use emp_proto::v1::{DropReason, GoalPhase};
 use prometheus_client::{
     encoding::{EncodeLabelSet, EncodeLabelValue, text},
     metrics::{
@@ -29,6 +30,15 @@ pub(crate) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0
 const TICKS: f64 = 100.0;
 /// Bytes a page in /proc/self/statm. ARM kernels with larger pages report too little memory here.
 const PAGE: f64 = 4096.0;
+
+/// Reasons of [`Metrics::call_refused`] that there usually are.
+const REFUSALS: [&str; 5] = [
+    "CREDENTIALS_MISSING",
+    "CREDENTIALS_UNKNOWN",
+    "CREDENTIALS_EXPIRED",
+    "PERMISSION_DENIED",
+    "OVERLOADED",
+];
 
 type Labelled<L, M> = Family<L, M>;
 type Histograms<L> = Family<L, Histogram, fn() -> Histogram>;
@@ -138,7 +148,7 @@ impl Metrics {
         let r = &mut registry;
         let build = Info::new([("version", env!("CARGO_PKG_VERSION"))]);
         r.register("emp_build", "The server's version", build);
-        Self {
+        let metrics = Self {
             calls: family(r, "emp_calls", "Calls that ended, by method and gRPC code"),
             call_seconds: times(r, "emp_call_seconds", "Time of single calls, by method"),
             open_calls: family(
@@ -226,6 +236,33 @@ impl Metrics {
             job_places: single(r, "emp_job_places", "Jobs that may run at once"),
             process: Process::new(r),
             registry,
+        };
+        metrics.begin();
+        metrics
+    }
+
+    /// Makes the series whose labels are known beforehand: a counter that first appears with its first event hides that event
+    /// from `increase`.
+    fn begin(&self) {
+        for reason in REFUSALS {
+            self.refused.get_or_create(&Reason { reason });
+        }
+        for reason in [LeftOut::Rate, LeftOut::Full] {
+            self.log_lines_left_out
+                .get_or_create(&LeftOutLabels { reason });
+        }
+        for what in ["certificates", "access", "audit"] {
+            for result in ["ok", "failed"] {
+                self.reloads.get_or_create(&ReloadLabels { what, result });
+            }
+        }
+        for reason in (1..).map_while(|number| DropReason::try_from(number).ok()) {
+            let reason = reason.as_str_name();
+            self.dropped.get_or_create(&Reason { reason });
+        }
+        for phase in (1..).map_while(|number| GoalPhase::try_from(number).ok()) {
+            let phase = phase.as_str_name();
+            self.guard_periods.get_or_create(&PhaseLabel { phase });
         }
     }
 
@@ -345,6 +382,12 @@ impl Metrics {
         self.guard_periods
             .get_or_create(&PhaseLabel { phase })
             .inc();
+    }
+
+    /// From now on falls of this robot are counted.
+    pub(crate) fn watch_falls(&self, robot: &str) {
+        let robot = robot.to_owned();
+        self.falls.get_or_create(&RobotLabel { robot });
     }
 
     pub(crate) fn fell(&self, robot: &str) {

@@ -9,9 +9,11 @@ use tempfile::TempDir;
 use tokio::{
     io::{AsyncReadExt as _, AsyncWriteExt as _},
     net::TcpStream,
+    sync::mpsc,
 };
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::{
-    Code, Request, Status,
+    Code, Request, Status, Streaming,
     client::Grpc,
     codegen::http::uri::PathAndQuery,
     transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity},
@@ -174,6 +176,40 @@ pub async fn call_with(
         Ok(_) => Status::new(Code::Ok, ""),
         Err(status) => status,
     })
+}
+
+/// A stream on which nothing is sent. Dropping it half-closes.
+pub struct HeldStream {
+    /// What the server says.
+    pub answers: Streaming<Vec<u8>>,
+    _requests: mpsc::Sender<Vec<u8>>,
+}
+
+impl HeldStream {
+    /// Opens one and waits for its headers; the inner error is the server's refusal.
+    ///
+    /// # Errors
+    /// When there is no answer in time.
+    pub async fn open(
+        channel: &Channel,
+        path: &str,
+        token: Option<&str>,
+    ) -> anyhow::Result<Result<Self, Status>> {
+        let (requests, messages) = mpsc::channel(1);
+        let mut request = Request::new(ReceiverStream::new(messages));
+        if let Some(token) = token {
+            let value = format!("Bearer {token}").parse()?;
+            request.metadata_mut().insert("authorization", value);
+        }
+        let mut client = Grpc::new(channel.clone());
+        client.ready().await?;
+        let answers = client.streaming(request, path.parse()?, Bytes);
+        let answers = within("the headers", answers).await?;
+        Ok(answers.map(|answers| Self {
+            answers: answers.into_inner(),
+            _requests: requests,
+        }))
+    }
 }
 
 /// Sends bytes over TCP and reads until the other end closes.

@@ -8,7 +8,7 @@ use emp_server::{ClientCertificates, NewIdentity, Role, Settings};
 use emp_tests::{
     TestServer,
     fake::{self, Gate},
-    network::{Folder, call, call_with, until},
+    network::{Folder, HeldStream, call, call_with, until},
     weights, within,
 };
 use prost::Message as _;
@@ -20,6 +20,8 @@ use tonic::{
 use tonic_types::StatusExt as _;
 
 const LIST_MODELS: &str = "/emp.v1.ModelService/ListModels";
+
+const TELEOPERATE: &str = "/emp.v1.MotionService/Teleoperate";
 
 const ROLES: [Role; 5] = [
     Role::Observer,
@@ -143,18 +145,9 @@ async fn wrong_expired_missing_and_revoked_tokens_are_refused_with_their_reason(
     assert_eq!(refused(expired.as_deref()).await?, "CREDENTIALS_EXPIRED");
 
     // A stream that is open ends with its token, and a new token counts, without a restart.
-    let watch = "/emp.v1.MotionService/Teleoperate";
-    let message = tokio_stream::pending::<Vec<u8>>();
-    let mut request = tonic::Request::new(message);
-    let value = format!("Bearer {token}").parse()?;
-    request.metadata_mut().insert("authorization", value);
-    let mut client = tonic::client::Grpc::new(channel.clone());
-    client.ready().await?;
-    let path = watch.parse()?;
-    let answers = client.streaming(request, path, emp_tests::raw::Bytes);
-    let mut answers = within("the headers", answers).await??.into_inner();
+    let mut held = HeldStream::open(&channel, TELEOPERATE, Some(&token)).await??;
     folder.revoke("good")?;
-    let end = within("the stream's end", answers.message()).await?;
+    let end = within("the stream's end", held.answers.message()).await?;
     let status = end.expect_err("revoked");
     assert_eq!(reason(&status), "CREDENTIALS_REVOKED", "{status:?}");
     assert_eq!(refused(Some(&token)).await?, "CREDENTIALS_UNKNOWN");
@@ -346,15 +339,8 @@ async fn an_identity_has_no_more_than_its_quota() -> anyhow::Result<()> {
     let mut open = Vec::new();
     let mut refused = None;
     for _ in 0..4 {
-        let mut request = tonic::Request::new(tokio_stream::pending::<Vec<u8>>());
-        let value = format!("Bearer {token}").parse()?;
-        request.metadata_mut().insert("authorization", value);
-        let mut client = tonic::client::Grpc::new(channel.clone());
-        client.ready().await?;
-        let path = "/emp.v1.MotionService/Teleoperate".parse()?;
-        let answers = client.streaming(request, path, emp_tests::raw::Bytes);
-        match within("the headers", answers).await? {
-            Ok(answers) => open.push(answers),
+        match HeldStream::open(&channel, TELEOPERATE, Some(&token)).await? {
+            Ok(stream) => open.push(stream),
             Err(status) => refused = Some(status),
         }
     }

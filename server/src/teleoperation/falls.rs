@@ -9,14 +9,24 @@ const FALLEN: f64 = 1.0;
 const STANDS: f64 = 0.5;
 
 /// One robot's watch.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct FallWatch {
+    robot: String,
     lies: bool,
 }
 
 impl FallWatch {
+    pub(super) fn new(robot: &str) -> Self {
+        metrics().watch_falls(robot);
+        Self {
+            robot: robot.to_owned(),
+            lies: false,
+        }
+    }
+
     /// Looks at the base's orientation in the world, once a control period.
-    pub(super) fn look(&mut self, orientation: &UnitQuaternion<f64>, robot: &str) {
+    pub(super) fn look(&mut self, orientation: &UnitQuaternion<f64>) {
+        let robot = self.robot.as_str();
         let tilt = (orientation * Vector3::z()).angle(&Vector3::z());
         if !self.lies && tilt > FALLEN {
             metrics().fell(robot);
@@ -34,7 +44,7 @@ mod tests {
 
     #[test]
     fn a_fall_is_counted_once_and_again_after_the_robot_stood() {
-        let mut watch = FallWatch::default();
+        let mut watch = FallWatch::new("test-falls");
         let fallen = || {
             let text = metrics().text();
             let count = text
@@ -44,10 +54,7 @@ mod tests {
             count
         };
         let mut look = |tilt: f64| {
-            watch.look(
-                &UnitQuaternion::from_euler_angles(0.3, tilt, 1.0),
-                "test-falls",
-            );
+            watch.look(&UnitQuaternion::from_euler_angles(0.3, tilt, 1.0));
             fallen()
         };
         assert_eq!(

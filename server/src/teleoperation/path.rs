@@ -71,7 +71,7 @@ impl<'a> Path<'a> {
             person: Person::default(),
             guard: GoalGuard::new(robot, settings),
             emp_mode: joined.member.emp_mode(),
-            falls: FallWatch::default(),
+            falls: FallWatch::new(&joined.policy.card.robot),
             past: state.with_guard(ExecutionGuard::new(robot, settings)),
         }
     }
@@ -83,8 +83,7 @@ impl<'a> Path<'a> {
     ) -> Result<TeleoperatedFrame, DroppedFrame> {
         let now = Instant::now();
         self.begin(&mut frame, now);
-        let robot = &self.joined.policy.card.robot;
-        self.falls.look(&frame.orientation, robot);
+        self.falls.look(&frame.orientation);
         let pose = self.take_pose(now, frame.deadline).await;
         // What follows leaves no trace if the frame is dropped.
         let mut guard = self.guard.clone();

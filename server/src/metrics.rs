@@ -245,24 +245,24 @@ impl Metrics {
     /// from `increase`.
     fn begin(&self) {
         for reason in REFUSALS {
-            self.refused.get_or_create(&Reason { reason });
+            self.refused.get_or_create_owned(&Reason { reason });
         }
         for reason in [LeftOut::Rate, LeftOut::Full] {
             self.log_lines_left_out
-                .get_or_create(&LeftOutLabels { reason });
+                .get_or_create_owned(&LeftOutLabels { reason });
         }
         for what in ["certificates", "access", "audit"] {
             for result in ["ok", "failed"] {
-                self.reloads.get_or_create(&ReloadLabels { what, result });
+                self.reloads.get_or_create_owned(&ReloadLabels { what, result });
             }
         }
         for reason in (1..).map_while(|number| DropReason::try_from(number).ok()) {
             let reason = reason.as_str_name();
-            self.dropped.get_or_create(&Reason { reason });
+            self.dropped.get_or_create_owned(&Reason { reason });
         }
         for phase in (1..).map_while(|number| GoalPhase::try_from(number).ok()) {
             let phase = phase.as_str_name();
-            self.guard_periods.get_or_create(&PhaseLabel { phase });
+            self.guard_periods.get_or_create_owned(&PhaseLabel { phase });
         }
     }
 
@@ -387,7 +387,7 @@ impl Metrics {
     /// From now on falls of this robot are counted.
     pub(crate) fn watch_falls(&self, robot: &str) {
         let robot = robot.to_owned();
-        self.falls.get_or_create(&RobotLabel { robot });
+        self.falls.get_or_create_owned(&RobotLabel { robot });
     }
 
     pub(crate) fn fell(&self, robot: &str) {

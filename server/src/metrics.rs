@@ -253,7 +253,8 @@ impl Metrics {
         }
         for what in ["certificates", "access", "audit"] {
             for result in ["ok", "failed"] {
-                self.reloads.get_or_create_owned(&ReloadLabels { what, result });
+                self.reloads
+                    .get_or_create_owned(&ReloadLabels { what, result });
             }
         }
         for reason in (1..).map_while(|number| DropReason::try_from(number).ok()) {
@@ -262,7 +263,8 @@ impl Metrics {
         }
         for phase in (1..).map_while(|number| GoalPhase::try_from(number).ok()) {
             let phase = phase.as_str_name();
-            self.guard_periods.get_or_create_owned(&PhaseLabel { phase });
+            self.guard_periods
+                .get_or_create_owned(&PhaseLabel { phase });
         }
     }
 

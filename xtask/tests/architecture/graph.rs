@@ -16,7 +16,7 @@ use syn::{
 const LONGEST_CHAIN: usize = 16;
 
 /// The modules of a crate, the root first.
-pub struct ModuleGraph {
+pub(crate) struct ModuleGraph {
     modules: Vec<Module>,
 }
 
@@ -50,7 +50,7 @@ struct Target {
 
 impl ModuleGraph {
     /// Reads a crate from its root file on.
-    pub fn read(root: &Path) -> Self {
+    pub(crate) fn read(root: &Path) -> Self {
         let mut graph = Self {
             modules: vec![Module::default()],
         };
@@ -104,7 +104,7 @@ impl ModuleGraph {
     }
 
     /// The circles, one line each: who uses what of whom.
-    pub fn circles(&self) -> Vec<String> {
+    pub(crate) fn circles(&self) -> Vec<String> {
         let edges: Vec<BTreeMap<usize, String>> =
             (0..self.modules.len()).map(|m| self.uses(m)).collect();
         let mut seen = BTreeSet::new();

@@ -93,7 +93,7 @@ fn two_server_processes_collect_what_this_one_would() -> anyhow::Result<()> {
     ];
     let urls = servers.each_ref().map(|server| server.url.clone());
     let mut here = local(&robot)?;
-    let mut there = RemoteSource::new(&urls, &robot, &settings(robot), &library(&robot)?)?;
+    let mut there = RemoteSource::new(&urls, &robot, &settings(&robot), &library(&robot)?)?;
     for _ in 0..3 {
         let served = collect(&mut there, &snapshot)?;
         assert_same(&served, &collect(&mut here, &snapshot)?);
@@ -112,7 +112,7 @@ fn a_server_that_comes_back_goes_on_where_it_was() -> anyhow::Result<()> {
     let server = TestServer::start_real()?;
     let (port, urls) = (server.port(), [server.url()]);
     let mut here = local(&robot)?;
-    let mut there = RemoteSource::new(&urls, &robot, &settings(robot), &library(&robot)?)?;
+    let mut there = RemoteSource::new(&urls, &robot, &settings(&robot), &library(&robot)?)?;
     let served = collect(&mut there, &snapshot)?;
     assert_same(&served, &collect(&mut here, &snapshot)?);
     server.kill();

@@ -260,10 +260,10 @@ fn glued(words: &[String]) -> Option<(Side, Part)> {
 }
 
 /// Whose names these are, for a person to read; the first row all of whose names are there wins.
-pub(crate) fn scheme<'a>(names: impl Iterator<Item = &'a str> + Clone) -> &'static str {
+pub(crate) fn scheme(names: &[&str]) -> &'static str {
     let has = |pattern: &&str| {
         let pattern = pattern.to_ascii_lowercase();
-        names.clone().any(|name| {
+        names.iter().any(|name| {
             let name = name.to_ascii_lowercase();
             pattern
                 .strip_suffix('*')
@@ -377,11 +377,8 @@ mod tests {
 
     #[test]
     fn schemes_have_names() {
-        assert_eq!(scheme(["mixamorig:Hips"].into_iter()), "Mixamo");
-        assert_eq!(
-            scheme(["Hips", "LeftArm", "LeftForeArm"].into_iter()),
-            "MotionBuilder"
-        );
-        assert_eq!(scheme(["a", "b"].into_iter()), "unknown");
+        assert_eq!(scheme(&["mixamorig:Hips"]), "Mixamo");
+        assert_eq!(scheme(&["Hips", "LeftArm", "LeftForeArm"]), "MotionBuilder");
+        assert_eq!(scheme(&["a", "b"]), "unknown");
     }
 }

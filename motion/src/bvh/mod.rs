@@ -57,7 +57,12 @@ pub fn from_bytes(
     let skeleton = Skeleton::find(path, &named, options, &mut warnings)?;
     let body = Body::new(&tree, &skeleton);
     let poses = |index: usize| tree.pose(document.frame(index));
-    let scheme = names::scheme(tree.joints.iter().map(|joint| joint.name.as_str()));
+    let joint_names: Vec<&str> = tree
+        .joints
+        .iter()
+        .map(|joint| joint.name.as_str())
+        .collect();
+    let scheme = names::scheme(&joint_names);
     let take = Take {
         format: "BVH",
         naming: scheme.to_owned(),

@@ -38,7 +38,7 @@ impl Points {
     /// A point in a frame, where it was seen.
     pub(super) fn position(&self, frame: usize, point: usize) -> Option<Vector3<f64>> {
         let position = self.positions[frame * self.labels.len() + point];
-        position.map(|p| p.cast::<f64>())
+        position.map(nalgebra::Matrix::cast::<f64>)
     }
 
     pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Self, MotionError> {

@@ -125,7 +125,7 @@ pub(crate) struct Reading {
     /// Axis that points up: x, y, z, -x, -y or -z [default: by the body and the floor]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     pub(crate) up: Option<UpAxis>,
-    /// The file's joint (or marker) for a key node, a hip (left_hip, right_hip): left_elbow=NAME; may be repeated
+    /// The file's joint (or marker) for a key node, a hip (`left_hip`, `right_hip`): `left_elbow=NAME`; may be repeated
     #[arg(long, value_name = "NODE=NAME", value_parser = mapping)]
     pub(crate) map: Vec<(BodyJoint, String)>,
     /// Whether the file holds the mirror image of its person [default: by feet, knees, thumbs and elbows]

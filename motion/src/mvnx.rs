@@ -117,7 +117,7 @@ impl Frame {
     fn orientation(&self, segment: usize) -> Option<Rotation3<f64>> {
         let q = &self.orientations[4 * segment..4 * segment + 4];
         let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-        UnitQuaternion::try_new(quaternion, 0.1).map(nalgebra::Unit::to_rotation_matrix)
+        UnitQuaternion::try_new(quaternion, 0.1).map(UnitQuaternion::to_rotation_matrix)
     }
 }
 

@@ -136,9 +136,9 @@ impl File {
             }
             let seen = if position.is_some() { 0.0 } else { -1.0 };
             if self.floats {
-                data.extend(p.float(seen))
+                data.extend(p.float(seen));
             } else {
-                data.extend(p.integer(seen as i16))
+                data.extend(p.integer(seen as i16));
             }
         }
         [header, parameters, data].concat()

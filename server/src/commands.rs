@@ -73,7 +73,7 @@ pub(crate) struct Add {
 
 #[derive(Args)]
 pub(crate) struct Cert {
-    /// Names and addresses by which clients reach the server [default: localhost 127.0.0.1 ::1]; with --client the client's name
+    /// Names and addresses by which clients reach the server [default: localhost 127.0.0.1 `::1`]; with --client the client's name
     names: Vec<String>,
     /// Folder of the files; its authority (ca.pem, ca-key.pem) is made when it is not there
     #[arg(long, value_name = "DIR", default_value = ".")]

@@ -94,7 +94,7 @@ async fn readyz(State(ready): State<watch::Receiver<bool>>) -> Response {
 
 async fn show_metrics(State(gate): State<Arc<Gate>>, request: Request) -> Response {
     if !gate.http.open_metrics
-        && let Err(refusal) = may_see(&gate, &request)
+        && let Some(refusal) = refusal(&gate, &request)
     {
         return refusal;
     }
@@ -105,13 +105,14 @@ async fn show_metrics(State(gate): State<Arc<Gate>>, request: Request) -> Respon
     (headers, metrics().text()).into_response()
 }
 
-fn may_see(gate: &Gate, request: &Request) -> Result<(), Response> {
+/// The answer to who may not see the metrics.
+fn refusal(gate: &Gate, request: &Request) -> Option<Response> {
     let peer = request.extensions().get::<Peer>();
     let certificate = peer.map(|peer| &*peer.certificate).unwrap_or_default();
     match gate.directory.find(request.headers(), certificate) {
-        Ok(identity) if identity.has(Role::Observer) => Ok(()),
-        Ok(_) => Err(StatusCode::FORBIDDEN.into_response()),
-        Err(error) => Err(unauthorized(&error)),
+        Ok(identity) if identity.has(Role::Observer) => None,
+        Ok(_) => Some(StatusCode::FORBIDDEN.into_response()),
+        Err(error) => Some(unauthorized(&error)),
     }
 }
 

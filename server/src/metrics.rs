@@ -268,7 +268,7 @@ impl Metrics {
         }
     }
 
-    /// Every metric in OpenMetrics' text form.
+    /// Every metric in the text form of `OpenMetrics`.
     pub(crate) fn text(&self) -> String {
         self.process.update();
         let mut text = String::new();

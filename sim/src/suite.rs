@@ -24,7 +24,7 @@ const LIGHT_PUSH: f64 = 0.3;
 /// Time between pushes, seconds: a clip of 200 frames has two or three.
 const PUSH_INTERVAL: f64 = 1.5;
 
-/// RandomizationLevel with a name.
+/// A condition with a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Condition {

@@ -11,8 +11,11 @@ use serde::Serialize;
 /// Percentiles over arms that are printed.
 const PERCENTILES: [f64; 3] = [0.1, 0.5, 0.9];
 
+/// How a figure is read off an arm.
+type Figure = fn(&ArmMotion) -> f64;
+
 /// The figures: their names, and how they are read off an arm.
-const FIGURES: [(&str, fn(&ArmMotion) -> f64); 6] = [
+const FIGURES: [(&str, Figure); 6] = [
     ("hand speed p95, m/s", |arm| arm.hand_speed[0]),
     ("hand speed top, m/s", |arm| arm.hand_speed[1]),
     ("hand acceleration p95, m/s²", |arm| arm.hand_acceleration),

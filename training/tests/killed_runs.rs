@@ -88,7 +88,8 @@ fn check(arguments: &[&str], rows: usize) {
 
 #[test]
 fn a_policy_resumes_bit_for_bit_at_any_number_of_threads() {
-    let arguments = "policy --steps 4096 --environments 16 --horizon 8 --procedural-clips 2";
+    let arguments = "policy --steps 4096 --set environments=16 --set horizon=8 --set procedural_clips=2 \
+                     --set evaluation_clips=2";
     check(&arguments.split(' ').collect::<Vec<_>>(), 32);
 }
 

@@ -165,8 +165,8 @@ impl Solver<'_> {
         self.minimise_within(target, &mut answer, &search, FOLLOW);
         memory.answer = answer;
         let objectives = self.arm_objectives(target, &memory.answer);
-        for side in 0..2 {
-            self.look_around(target, &mut memory, side, objectives[side], seconds);
+        for (side, objective) in objectives.into_iter().enumerate() {
+            self.look_around(target, &mut memory, side, objective, seconds);
         }
         memory
     }

@@ -184,7 +184,7 @@ mod tests {
         headers
     }
 
-    fn reason<T>(result: Result<T, ServiceError>) -> &'static str {
+    fn reason<T>(result: &Result<T, ServiceError>) -> &'static str {
         match result {
             Err(ServiceError::Unauthenticated(reason)) => reason,
             Err(_) => "another error",
@@ -219,22 +219,22 @@ mod tests {
             "Bearer".to_owned(),
             String::new(),
         ] {
-            assert_eq!(reason(find(&wrong)), "CREDENTIALS_UNKNOWN", "{wrong}");
+            assert_eq!(reason(&find(&wrong)), "CREDENTIALS_UNKNOWN", "{wrong}");
         }
         let by_certificate = |name: &str| directory.find(&HeaderMap::new(), &[name.to_owned()]);
         assert_eq!(by_certificate("robot.lab").expect("known").name(), "three");
-        assert_eq!(reason(by_certificate("other.lab")), "CREDENTIALS_UNKNOWN");
+        assert_eq!(reason(&by_certificate("other.lab")), "CREDENTIALS_UNKNOWN");
         let missing = directory.find(&HeaderMap::new(), &[]);
-        assert_eq!(reason(missing), "CREDENTIALS_MISSING");
+        assert_eq!(reason(&missing), "CREDENTIALS_MISSING");
         let mut twice = headers(&format!("Bearer {token}"));
         twice.append(AUTHORIZATION, "Bearer x".parse().expect("a header"));
-        assert_eq!(reason(directory.find(&twice, &[])), "CREDENTIALS_UNKNOWN");
+        assert_eq!(reason(&directory.find(&twice, &[])), "CREDENTIALS_UNKNOWN");
 
         AccessFile::revoke(&path, "one").expect("revoked");
         directory.reload().expect("sound");
         assert!(one.revoked.is_cancelled() && !two.revoked.is_cancelled());
         assert_eq!(
-            reason(find(&format!("Bearer {token}"))),
+            reason(&find(&format!("Bearer {token}"))),
             "CREDENTIALS_UNKNOWN"
         );
         std::fs::write(&path, "nonsense").expect("written");
@@ -257,6 +257,6 @@ mod tests {
             .expect("a token");
         let directory = Directory::open(Some(&path)).expect("sound");
         let found = directory.find(&headers(&format!("Bearer {token}")), &[]);
-        assert_eq!(reason(found), "CREDENTIALS_EXPIRED");
+        assert_eq!(reason(&found), "CREDENTIALS_EXPIRED");
     }
 }

@@ -32,7 +32,7 @@ pub struct TlsError {
 }
 
 impl TlsError {
-    fn new(path: &Path, what: impl ToString) -> Self {
+    fn new(path: &Path, what: &impl ToString) -> Self {
         Self {
             path: path.to_owned(),
             what: what.to_string(),
@@ -102,17 +102,17 @@ impl Files {
     fn config(&self) -> Result<Arc<ServerConfig>, TlsError> {
         let provider = Arc::new(ring::default_provider());
         let key = PrivateKeyDer::from_pem_file(&self.key)
-            .map_err(|error| TlsError::new(&self.key, error))?;
+            .map_err(|error| TlsError::new(&self.key, &error))?;
         let builder = ServerConfig::builder_with_provider(Arc::clone(&provider))
             .with_safe_default_protocol_versions()
-            .map_err(|error| TlsError::new(&self.certificate, error))?;
+            .map_err(|error| TlsError::new(&self.certificate, &error))?;
         let builder = match self.client_verifier(&provider)? {
             Some(verifier) => builder.with_client_cert_verifier(verifier),
             None => builder.with_no_client_auth(),
         };
         let mut config = builder
             .with_single_cert(certificates(&self.certificate)?, key)
-            .map_err(|error| TlsError::new(&self.certificate, error))?;
+            .map_err(|error| TlsError::new(&self.certificate, &error))?;
         config.alpn_protocols = PROTOCOLS.map(<[u8]>::to_vec).to_vec();
         Ok(Arc::new(config))
     }
@@ -128,7 +128,7 @@ impl Files {
         for certificate in certificates(path)? {
             roots
                 .add(certificate)
-                .map_err(|error| TlsError::new(path, error))?;
+                .map_err(|error| TlsError::new(path, &error))?;
         }
         let builder =
             WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(provider));
@@ -138,7 +138,7 @@ impl Files {
         };
         let verifier = builder
             .build()
-            .map_err(|error| TlsError::new(path, error))?;
+            .map_err(|error| TlsError::new(path, &error))?;
         Ok(Some(verifier))
     }
 }
@@ -146,9 +146,9 @@ impl Files {
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, TlsError> {
     let certificates: Vec<_> = CertificateDer::pem_file_iter(path)
         .and_then(Iterator::collect)
-        .map_err(|error| TlsError::new(path, error))?;
+        .map_err(|error| TlsError::new(path, &error))?;
     if certificates.is_empty() {
-        return Err(TlsError::new(path, "it has no certificate"));
+        return Err(TlsError::new(path, &"it has no certificate"));
     }
     Ok(certificates)
 }

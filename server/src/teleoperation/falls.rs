@@ -47,11 +47,9 @@ mod tests {
         let mut watch = FallWatch::new("test-falls");
         let fallen = || {
             let text = metrics().text();
-            let count = text
-                .lines()
+            text.lines()
                 .find_map(|line| line.strip_prefix("emp_falls_total{robot=\"test-falls\"} "))
-                .map_or(0, |count| count.parse().expect("a count"));
-            count
+                .map_or(0, |count| count.parse().expect("a count"))
         };
         let mut look = |tilt: f64| {
             watch.look(&UnitQuaternion::from_euler_angles(0.3, tilt, 1.0));

@@ -230,7 +230,7 @@ impl Trainer {
         for (name, tensor) in self.learner.actor()? {
             tensors.insert(format!("{NETWORK_PREFIX}.{name}"), tensor);
         }
-        self.from_tensors(tensors)
+        self.policy_of(tensors)
     }
 
     /// The policy as it would be served now: with the precision of the file that ships.
@@ -240,10 +240,10 @@ impl Trainer {
     fn shipped(&self) -> Result<Policy> {
         let (normalizer, actor) = (self.learner.normalizer(), self.learner.actor()?);
         let tensors = shipped_tensors(NETWORK_PREFIX, &normalizer, &actor)?;
-        self.from_tensors(tensors)
+        self.policy_of(tensors)
     }
 
-    fn from_tensors(&self, tensors: Tensors) -> Result<Policy> {
+    fn policy_of(&self, tensors: Tensors) -> Result<Policy> {
         let (config, robot) = (self.config.clone(), Arc::clone(&self.robot));
         let metadata = CheckpointMetadata::for_joints(policy::KIND, &robot, robot.joints());
         Policy::from_tensors(config, robot, tensors, metadata).map_err(anyhow::Error::msg)

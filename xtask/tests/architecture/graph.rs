@@ -1,7 +1,7 @@
 //! Which modules of a crate use which, read from its sources.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque, btree_map::Entry},
     fs,
     path::{Path, PathBuf},
 };
@@ -203,8 +203,8 @@ fn shortest_circle(edges: &[BTreeMap<usize, String>], start: usize) -> Option<Ve
                 circle.reverse();
                 return Some(circle);
             }
-            if !came_from.contains_key(&next) {
-                came_from.insert(next, module);
+            if let Entry::Vacant(unseen) = came_from.entry(next) {
+                unseen.insert(module);
                 queue.push_back(next);
             }
         }

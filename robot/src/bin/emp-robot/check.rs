@@ -258,11 +258,11 @@ impl Report {
             return;
         };
         self.line("hold", format!("after {HOLD} s base tilted by {tilt:.3} rad, {name:?} {distance:.3} rad from its default"));
-        if !(tilt < UPRIGHT) {
+        if tilt.is_nan() || tilt >= UPRIGHT {
             self.warn(format!(
                 "held at its default pose, the robot falls within {HOLD} s"
             ));
-        } else if !(distance < HELD) {
+        } else if distance.is_nan() || distance >= HELD {
             self.warn(format!("held at its default pose, {name:?} gives way by {distance:.2} rad: kp or torque_limit is low"));
         }
     }

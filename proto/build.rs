@@ -13,7 +13,7 @@ const FILES: [&str; 8] = [
     "emp/v1/pose.proto",
     "emp/v1/robot_state.proto",
     "emp/v1/rollout_service.proto",
-    "emp/v1/teleoperation.proto",
+    "emp/v1/teleoperation_service.proto",
 ];
 
 fn main() -> Result<(), Box<dyn Error>> {

@@ -11,7 +11,7 @@ use crate::ClientError;
 /// The server's reason when somebody holds the place in a session that was asked for.
 const SEAT_TAKEN: &str = "SEAT_TAKEN";
 
-/// Exponential backoff with full jitter.
+/// Exponential backoff with equal jitter: each pause is half fixed, half random.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Backoff {
     /// Upper end of the first pause.

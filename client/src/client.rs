@@ -4,9 +4,14 @@ use std::time::{Duration, Instant};
 
 use emp_motion::{Clip, KeyNodeFrame};
 use emp_proto::v1::{
-    CollectRolloutsConfig, EvaluateConfig, FilterGoalRequest, GetModelRequest, GetRobotRequest,
-    GoalClip, ListModelsRequest, Model, RetargetRequest, Robot, TeleoperationRole,
-    model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
+    CancelJobRequest, CollectRolloutsConfig, ControlRequest, ControlResponse,
+    ControllerDescription, EndSessionRequest, EvaluationConfig, FilterGoalRequest, GetModelRequest,
+    GetRobotRequest, GetServerInfoRequest, GetServerInfoResponse, GetSessionRequest, GoalClip, Job,
+    ListControllersRequest, ListJobsRequest, ListModelsRequest, ListRobotsRequest,
+    ListSessionsRequest, Model, ReloadRequest, ReloadedModel, RetargetRequest, Robot, RobotSummary,
+    Session, model_service_client::ModelServiceClient, motion_service_client::MotionServiceClient,
+    rollout_service_client::RolloutServiceClient,
+    teleoperation_service_client::TeleoperationServiceClient,
 };
 use tonic::transport::{Channel, Endpoint};
 
@@ -14,7 +19,9 @@ use crate::{
     Answer, Backoff, ClientError, Collection, Evaluation, FilterAnswer, FilterConfig, FrameSender,
     GoalFrame, GoalHistory, PolicyAnswer, PolicyConfig, PoseSender, RobotFrame, SessionEvents,
     StreamConfig, StreamEvents, TeleoperationAnswer, TeleoperationConfig, TeleoperationFrame,
-    driver, listener, teleoperation::RobotEnd, wire,
+    driver, listener,
+    teleoperation::{RobotEnd, Role},
+    wire,
 };
 
 /// Both ends of a stream with a robot at its end.
@@ -71,7 +78,7 @@ impl Client {
     /// When the call fails.
     pub async fn models(&self) -> Result<Vec<Model>, ClientError> {
         let mut service = self.model_service();
-        let response = service.list_models(ListModelsRequest {}).await?;
+        let response = service.list_models(ListModelsRequest::default()).await?;
         Ok(response.into_inner().models)
     }
 
@@ -85,6 +92,37 @@ impl Client {
         let response = service.get_model(GetModelRequest { name }).await?;
         let model = response.into_inner().model;
         model.ok_or(ClientError::Contract("GetModel without a model"))
+    }
+
+    /// What the server is: its version, limits and guard times.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn server_info(&self) -> Result<GetServerInfoResponse, ClientError> {
+        let mut service = self.model_service();
+        let response = service.get_server_info(GetServerInfoRequest {}).await?;
+        Ok(response.into_inner())
+    }
+
+    /// Every robot that the server has, those that it cannot serve too.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn robots(&self) -> Result<Vec<RobotSummary>, ClientError> {
+        let mut service = self.model_service();
+        let response = service.list_robots(ListRobotsRequest {}).await?;
+        Ok(response.into_inner().robots)
+    }
+
+    /// Has the weights of a robot loaded anew, or of every robot where `robot` is empty.
+    ///
+    /// # Errors
+    /// When the call fails. What became of each model, the answer says.
+    pub async fn reload(&self, robot: &str) -> Result<Vec<ReloadedModel>, ClientError> {
+        let robot = robot.to_owned();
+        let mut service = self.model_service();
+        let response = service.reload(ReloadRequest { robot }).await?;
+        Ok(response.into_inner().models)
     }
 
     /// One robot.
@@ -134,7 +172,7 @@ impl Client {
         &self,
         config: StreamConfig,
     ) -> Result<(FrameSender, StreamEvents), ClientError> {
-        driver::start(self.motion_service(), config, self.backoff).await
+        driver::start(self.channel.clone(), config, self.backoff).await
     }
 
     /// Filters one goal: moves it as far as the robot's state needs, and says how the robot stands with it. The answer's
@@ -177,14 +215,14 @@ impl Client {
         &self,
         config: FilterConfig,
     ) -> Result<(FrameSender<GoalFrame>, StreamEvents<FilterAnswer>), ClientError> {
-        driver::start(self.motion_service(), config, self.backoff).await
+        driver::start(self.channel.clone(), config, self.backoff).await
     }
 
     /// Opens a stream of robot states, one a control period; its answers are leg targets. The first frame starts an
     /// episode, and so does one with `reset`.
     ///
-    /// A lost connection is restored as that of [`Self::stream`], but the server's history of the robot is lost with it:
-    /// after [`Event::Reconnected`](crate::Event::Reconnected) the next frame starts a new episode.
+    /// A lost connection is restored with backoff. What a robot measured before is never sent again, and the server's history of
+    /// the robot is lost: after [`Event::Reconnected`](crate::Event::Reconnected) the next frame starts a new episode.
     ///
     /// # Errors
     /// When the server refuses the stream.
@@ -192,7 +230,7 @@ impl Client {
         &self,
         config: PolicyConfig,
     ) -> Result<(FrameSender<RobotFrame>, StreamEvents<PolicyAnswer>), ClientError> {
-        driver::start(self.motion_service(), config, self.backoff).await
+        driver::start(self.channel.clone(), config, self.backoff).await
     }
 
     /// Opens a teleoperation session and holds both its ends: poses and robot states in, the whole path's answers out. Observers
@@ -207,9 +245,9 @@ impl Client {
         &self,
         config: TeleoperationConfig,
     ) -> Result<TeleoperationStream, ClientError> {
-        let role = TeleoperationRole::Both;
+        let role = Role::Both;
         let end = RobotEnd { config, role };
-        driver::start(self.motion_service(), end, self.backoff).await
+        driver::start(self.channel.clone(), end, self.backoff).await
     }
 
     /// Joins a teleoperation session as its robot: states in, one a control period, the whole path's answers out. The poses are
@@ -221,9 +259,9 @@ impl Client {
         &self,
         config: TeleoperationConfig,
     ) -> Result<TeleoperationStream, ClientError> {
-        let role = TeleoperationRole::Robot;
+        let role = Role::Robot;
         let end = RobotEnd { config, role };
-        driver::start(self.motion_service(), end, self.backoff).await
+        driver::start(self.channel.clone(), end, self.backoff).await
     }
 
     /// Joins a teleoperation session as its operator: poses in, what the robot executes out. A lost connection is restored with
@@ -235,8 +273,8 @@ impl Client {
         &self,
         config: TeleoperationConfig,
     ) -> Result<(PoseSender, SessionEvents), ClientError> {
-        let role = TeleoperationRole::Operator;
-        listener::start(self.motion_service(), config, role, self.backoff).await
+        let role = Role::Operator;
+        listener::start(self.channel.clone(), config, role, self.backoff).await
     }
 
     /// Listens to a teleoperation session. A lost connection is restored with backoff.
@@ -244,19 +282,107 @@ impl Client {
     /// # Errors
     /// When the server refuses the stream.
     pub async fn observe(&self, config: TeleoperationConfig) -> Result<SessionEvents, ClientError> {
-        let role = TeleoperationRole::Observer;
-        let (_, events) =
-            listener::start(self.motion_service(), config, role, self.backoff).await?;
+        let role = Role::Observer;
+        let (_, events) = listener::start(self.channel.clone(), config, role, self.backoff).await?;
         Ok(events)
+    }
+
+    /// Commands a session. The answer's lease goes into the next command.
+    ///
+    /// # Errors
+    /// When the call fails, with `FAILED_PRECONDITION` where another controller has the session.
+    pub async fn control(&self, request: ControlRequest) -> Result<ControlResponse, ClientError> {
+        let mut service = self.teleoperation_service();
+        Ok(service.control(request).await?.into_inner())
+    }
+
+    /// The open sessions.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn sessions(&self) -> Result<Vec<Session>, ClientError> {
+        let mut service = self.teleoperation_service();
+        let response = service
+            .list_sessions(ListSessionsRequest::default())
+            .await?;
+        Ok(response.into_inner().sessions)
+    }
+
+    /// One session.
+    ///
+    /// # Errors
+    /// When the call fails, with `NOT_FOUND` where there is none.
+    pub async fn session(&self, name: &str) -> Result<Session, ClientError> {
+        let name = name.to_owned();
+        let mut service = self.teleoperation_service();
+        let response = service.get_session(GetSessionRequest { name }).await?;
+        let session = response.into_inner().session;
+        session.ok_or(ClientError::Contract("GetSession without a session"))
+    }
+
+    /// Ends a session: the streams of everyone in it end.
+    ///
+    /// # Errors
+    /// When the call fails, with `NOT_FOUND` where there is none.
+    pub async fn end_session(&self, name: &str) -> Result<(), ClientError> {
+        let name = name.to_owned();
+        let mut service = self.teleoperation_service();
+        service.end_session(EndSessionRequest { name }).await?;
+        Ok(())
+    }
+
+    /// The controllers that can be evaluated for a robot; for any where `robot` is empty.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn controllers(
+        &self,
+        robot: &str,
+    ) -> Result<Vec<ControllerDescription>, ClientError> {
+        let robot = robot.to_owned();
+        let mut service = RolloutServiceClient::new(self.channel.clone());
+        let response = service
+            .list_controllers(ListControllersRequest { robot })
+            .await?;
+        Ok(response.into_inner().controllers)
+    }
+
+    /// The jobs that run, and the last evaluations that have ended.
+    ///
+    /// # Errors
+    /// When the call fails.
+    pub async fn jobs(&self) -> Result<Vec<Job>, ClientError> {
+        let mut service = RolloutServiceClient::new(self.channel.clone());
+        let response = service.list_jobs(ListJobsRequest {}).await?;
+        Ok(response.into_inner().jobs)
+    }
+
+    /// Cancels a job, or throws the results of one that has ended away.
+    ///
+    /// # Errors
+    /// When the call fails, with `NOT_FOUND` where there is none.
+    pub async fn cancel_job(&self, id: &str) -> Result<(), ClientError> {
+        let id = id.to_owned();
+        let mut service = RolloutServiceClient::new(self.channel.clone());
+        service.cancel_job(CancelJobRequest { id }).await?;
+        Ok(())
+    }
+
+    /// Watches an evaluation, from its start or from a later event on.
+    ///
+    /// # Errors
+    /// When the call fails, with `NOT_FOUND` where there is none.
+    pub async fn watch(&self, job: &str, first_event: u64) -> Result<Evaluation, ClientError> {
+        Evaluation::watch(self.channel.clone(), job.to_owned(), first_event).await
     }
 
     /// Has a controller evaluated on recorded motions, beside the procedural ones of the config.
     ///
     /// # Errors
-    /// When the server cannot be reached. What else it refuses, the evaluation's messages say.
+    /// When the server cannot be reached, or refuses the evaluation.
     pub async fn evaluate(
         &self,
-        config: EvaluateConfig,
+        config: EvaluationConfig,
         motions: Vec<Clip>,
     ) -> Result<Evaluation, ClientError> {
         Evaluation::start(self.channel.clone(), config, motions).await
@@ -276,6 +402,10 @@ impl Client {
 
     fn motion_service(&self) -> MotionServiceClient<Channel> {
         MotionServiceClient::new(self.channel.clone())
+    }
+
+    fn teleoperation_service(&self) -> TeleoperationServiceClient<Channel> {
+        TeleoperationServiceClient::new(self.channel.clone())
     }
 
     fn model_service(&self) -> ModelServiceClient<Channel> {

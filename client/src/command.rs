@@ -2,12 +2,19 @@
 
 use std::{path::Path, time::Duration};
 
-use emp_client::Client;
+use emp_client::{Backoff, Client};
 use emp_motion::{Clip, ReadOptions, Understanding};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 /// The exit code after Ctrl-C.
 pub(crate) const INTERRUPTED: u8 = 130;
+
+/// Pauses of a live source: it is back within half a second of its server.
+pub(crate) const LIVE: Backoff = Backoff {
+    first: Duration::from_millis(50),
+    longest: Duration::from_millis(400),
+    give_up: Duration::from_secs(60),
+};
 
 /// A recorded motion at a robot's control rate, and that rate, Hz. What the file was taken for is said on standard error.
 pub(crate) async fn recording(

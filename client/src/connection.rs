@@ -15,6 +15,8 @@ use crate::{Backoff, ClientError, backoff::Break};
 pub(crate) const HAND_OVER: usize = 4;
 /// Events that wait for the program.
 pub(crate) const EVENTS: usize = 256;
+/// A connection that stood for this long was a good one.
+const STEADY: Duration = Duration::from_secs(5);
 /// How long a server may take to accept a stream.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -92,12 +94,22 @@ pub(crate) struct Attempts {
 }
 
 impl Attempts {
-    pub(crate) fn after(last: Break, backoff: Backoff) -> Self {
-        Self {
-            backoff,
-            start: Instant::now(),
-            number: 0,
-            last,
+    /// Attempts after a connection that `stood` for a while broke. One that broke at once counts as another failed attempt of
+    /// those `before` it: a server that accepts and fails is not asked for ever at the shortest pause.
+    pub(crate) fn after(
+        last: Break,
+        backoff: Backoff,
+        before: Option<Self>,
+        stood: Duration,
+    ) -> Self {
+        match before {
+            Some(before) if stood < STEADY => Self { last, ..before },
+            _ => Self {
+                backoff,
+                start: Instant::now(),
+                number: 0,
+                last,
+            },
         }
     }
 

@@ -2,7 +2,6 @@
 
 use std::{collections::VecDeque, time::Instant};
 
-use emp_proto::v1::{Delivery, motion_service_client::MotionServiceClient};
 use tokio::{sync::mpsc, time::sleep_until};
 use tonic::{Status, transport::Channel};
 
@@ -20,20 +19,22 @@ const WINDOW: usize = 64;
 
 /// Opens a stream and starts its driver.
 pub(crate) async fn start<K: Kind>(
-    service: MotionServiceClient<Channel>,
-    config: K,
+    channel: Channel,
+    mut config: K,
     backoff: Backoff,
 ) -> Result<(FrameSender<K::Frame>, StreamEvents<K::Answer>), ClientError> {
-    let (connection, started) = open(&service, &config).await?;
+    let (connection, started) = open(&channel, &config).await?;
+    config.accepted(&started);
     let (frames, from_program) = mpsc::channel(HAND_OVER);
     let (to_program, events) = mpsc::channel(EVENTS);
     let Started {
         model,
         model_version,
         joint_names,
+        ..
     } = started;
     let driver = Driver {
-        service,
+        channel,
         config,
         backoff,
         frames: from_program,
@@ -62,11 +63,8 @@ pub(crate) async fn start<K: Kind>(
 /// One call.
 type Connection<K> = connection::Connection<<K as Kind>::Request, <K as Kind>::Response>;
 
-async fn open<K: Kind>(
-    service: &MotionServiceClient<Channel>,
-    config: &K,
-) -> Result<(Connection<K>, Started), Break> {
-    let call = |requests| K::call(service.clone(), requests);
+async fn open<K: Kind>(channel: &Channel, config: &K) -> Result<(Connection<K>, Started), Break> {
+    let call = |requests| K::call(channel.clone(), requests);
     let started = |response| match K::sort(response) {
         Some(Incoming::Started(started)) => Some(started),
         _ => None,
@@ -82,7 +80,7 @@ struct Unanswered<K: Kind> {
 }
 
 struct Driver<K: Kind> {
-    service: MotionServiceClient<Channel>,
+    channel: Channel,
     config: K,
     backoff: Backoff,
     frames: mpsc::Receiver<Outbound<K::Frame>>,
@@ -107,12 +105,18 @@ enum Step<K: Kind> {
 
 impl<K: Kind> Driver<K> {
     async fn run(mut self, mut connection: Connection<K>) {
+        let mut attempts: Option<Attempts> = None;
         let end = loop {
+            let since = Instant::now();
             match self.converse(connection).await {
-                End::Broken(end) if end.is_worth_retrying() => match self.reconnect(end).await {
-                    Ok(new) => connection = new,
-                    Err(end) => break end,
-                },
+                End::Broken(end) if end.is_worth_retrying() => {
+                    let next = Attempts::after(end, self.backoff, attempts.take(), since.elapsed());
+                    let next = attempts.insert(next);
+                    match self.reconnect(next).await {
+                        Ok(new) => connection = new,
+                        Err(end) => break end,
+                    }
+                }
                 end => break end,
             }
         };
@@ -139,7 +143,7 @@ impl<K: Kind> Driver<K> {
                 Step::Sent(true) => self.unsent += 1,
                 // The transport is gone; the responses say why.
                 Step::Sent(false) => connection.requests = None,
-                Step::Frame(Some(frame)) => self.window.push_back(unanswered(frame)),
+                Step::Frame(Some(frame)) => self.window.push_back(self.unanswered(frame)),
                 Step::Frame(None) => self.sending = false,
                 Step::Response(Ok(Some(response))) => {
                     if let Err(end) = self.take(response).await {
@@ -157,12 +161,14 @@ impl<K: Kind> Driver<K> {
 
     /// Takes a message and tells the program of it.
     async fn take(&mut self, response: K::Response) -> Result<(), End> {
-        let event = self.event(response).map_err(End::Failed)?;
-        self.tell(event).await
+        match self.event(response).map_err(End::Failed)? {
+            Some(event) => self.tell(event).await,
+            None => Ok(()),
+        }
     }
 
     /// Takes an answered or dropped frame out of the window.
-    fn event(&mut self, response: K::Response) -> Result<Event<K::Answer>, ClientError> {
+    fn event(&mut self, response: K::Response) -> Result<Option<Event<K::Answer>>, ClientError> {
         match K::sort(response) {
             Some(Incoming::Result {
                 number,
@@ -173,13 +179,17 @@ impl<K: Kind> Driver<K> {
                 let result = result.ok_or(ClientError::Contract("an answer without a result"))?;
                 let times = wire::times(timing, first_sent.elapsed());
                 let answer = K::answer(number, result, times);
-                Ok(Event::Answer(answer))
+                Ok(Some(Event::Answer(answer)))
             }
             Some(Incoming::Dropped(message)) => {
                 let dropped = wire::dropped(message);
                 self.settle(dropped.sequence_number)?;
-                Ok(Event::Dropped(dropped))
+                Ok(Some(Event::Dropped(dropped)))
             }
+            Some(Incoming::GoingAway(notice)) => Ok(Some(Event::GoingAway {
+                grace: wire::duration(notice.grace),
+            })),
+            Some(Incoming::Other) => Ok(None),
             Some(Incoming::Started(_)) => Err(ClientError::Contract("a stream that starts twice")),
             None => Err(ClientError::EMPTY_MESSAGE),
         }
@@ -200,9 +210,8 @@ impl<K: Kind> Driver<K> {
     }
 
     /// Restores the connection, or says why it cannot be.
-    async fn reconnect(&mut self, last: Break) -> Result<Connection<K>, End> {
+    async fn reconnect(&mut self, attempts: &mut Attempts) -> Result<Connection<K>, End> {
         self.unsent = 0;
-        let mut attempts = Attempts::after(last, self.backoff);
         loop {
             let (reason, attempt, retry_in) = attempts.another()?;
             self.tell(Event::ConnectionLost {
@@ -212,11 +221,13 @@ impl<K: Kind> Driver<K> {
             })
             .await?;
             self.wait(Instant::now() + retry_in).await?;
-            match open(&self.service, &self.config).await {
+            let opened = self.open_again().await?;
+            match opened {
                 Ok((_, started)) if started.joint_names != self.joint_names => {
                     return Err(End::contract("the server came back with other joints"));
                 }
-                Ok((connection, _)) => {
+                Ok((connection, started)) => {
+                    self.config.accepted(&started);
                     let resent = self.window.len();
                     self.tell(Event::Reconnected { resent }).await?;
                     return Ok(connection);
@@ -226,9 +237,27 @@ impl<K: Kind> Driver<K> {
         }
     }
 
-    /// Waits for the next attempt. With `LATEST` whatever is unanswered or sent meanwhile is dropped: it would be stale.
+    /// One attempt; what would be stale by then is dropped meanwhile.
+    async fn open_again(&mut self) -> Result<Result<(Connection<K>, Started), Break>, End> {
+        let (channel, config) = (self.channel.clone(), self.config.clone());
+        let opening = open(&channel, &config);
+        tokio::pin!(opening);
+        let stale = !self.config.resends();
+        loop {
+            tokio::select! {
+                opened = &mut opening => return Ok(opened),
+                () = self.events.closed() => return Err(End::Abandoned),
+                frame = self.frames.recv(), if stale && self.sending => match frame {
+                    Some(frame) => self.tell(lost(frame.number)).await?,
+                    None => self.sending = false,
+                },
+            }
+        }
+    }
+
+    /// Waits for the next attempt. What would be stale, unanswered or sent meanwhile, is dropped.
     async fn wait(&mut self, until: Instant) -> Result<(), End> {
-        let latest = self.config.delivery() == Delivery::Latest;
+        let latest = !self.config.resends();
         loop {
             while latest && let Some(frame) = self.window.pop_front() {
                 self.tell(lost(frame.number)).await?;
@@ -237,10 +266,24 @@ impl<K: Kind> Driver<K> {
                 () = sleep_until(until.into()) => return Ok(()),
                 () = self.events.closed() => return Err(End::Abandoned),
                 frame = self.frames.recv(), if latest && self.sending => match frame {
-                    Some(frame) => self.window.push_back(unanswered(frame)),
+                    Some(frame) => self.tell(lost(frame.number)).await?,
                     None => self.sending = false,
                 },
             }
+        }
+    }
+
+    fn unanswered(&self, outbound: Outbound<K::Frame>) -> Unanswered<K> {
+        let Outbound {
+            number,
+            frame,
+            time_budget,
+        } = outbound;
+        let header = wire::header(number, time_budget);
+        Unanswered {
+            number,
+            message: self.config.frame(header, &frame),
+            first_sent: Instant::now(),
         }
     }
 
@@ -265,19 +308,6 @@ async fn send<K: Kind>(
             Err(_) => false,
         },
         _ => std::future::pending().await,
-    }
-}
-
-fn unanswered<K: Kind>(outbound: Outbound<K::Frame>) -> Unanswered<K> {
-    let Outbound {
-        number,
-        frame,
-        time_budget,
-    } = outbound;
-    Unanswered {
-        number,
-        message: K::frame(wire::header(number, time_budget), &frame),
-        first_sent: Instant::now(),
     }
 }
 

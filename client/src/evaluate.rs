@@ -5,11 +5,11 @@ use std::{path::Path, process::ExitCode};
 use anyhow::Context as _;
 use csv::Writer;
 use emp_client::{
-    Client, ClientError, ClipSource, EpisodeEnd, EpisodeMetrics, EpisodeResult, EvaluateConfig,
-    Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult, EvaluationStarted,
+    Client, ClientError, ClipSource, EpisodeEnd, EpisodeMetrics, EpisodeResult, Evaluation,
+    EvaluationConfig, EvaluationEvent, EvaluationMetrics, EvaluationResult, EvaluationStarted,
     GoalStatistics, MassRange, Metric, ProceduralClips, Push, Randomization, Spread,
 };
-use emp_motion::atomic;
+use emp_motion::atomic::AtomicFile;
 use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
@@ -56,10 +56,12 @@ pub(crate) async fn run(
         left_out: recordings.left_out,
         ..Outcome::default()
     };
-    let mut evaluation = client.evaluate(config(command), recordings.clips).await?;
+    let mut evaluation = client.evaluate(config(command)?, recordings.clips).await?;
     let end = follow(&mut evaluation, &mut outcome).await;
-    // A job that goes on for nobody would keep others out.
-    drop(evaluation);
+    if !matches!(end, End::Complete) {
+        // A job that goes on for nobody would keep others out; a server that is gone has none.
+        let _ = client.cancel_job(evaluation.job()).await;
+    }
     outcome.episodes.sort_by_key(|episode| episode.episode);
     // Of an evaluation that never began there is nothing to report.
     if let Some(started) = &outcome.started {
@@ -89,14 +91,14 @@ fn report(
     Ok(())
 }
 
-fn config(command: &Evaluate) -> EvaluateConfig {
+fn config(command: &Evaluate) -> anyhow::Result<EvaluationConfig> {
     let randomization = match command.randomization {
         cli::Randomization::Nominal => Randomization::Nominal,
         cli::Randomization::Full => Randomization::Full,
     };
-    EvaluateConfig {
+    Ok(EvaluationConfig {
         robot: command.robot.clone(),
-        controller: command.controller.clone(),
+        controller: Some(emp_client::controller(&command.controller)?),
         episodes: command.episodes.unwrap_or_default(),
         seed: command.seed,
         hand_load: command
@@ -114,8 +116,8 @@ fn config(command: &Evaluate) -> EvaluateConfig {
             seed: command.seed,
         }),
         clip_frames: command.frames.unwrap_or_default(),
-        ..EvaluateConfig::default()
-    }
+        ..EvaluationConfig::default()
+    })
 }
 
 async fn follow(evaluation: &mut Evaluation, outcome: &mut Outcome) -> End {
@@ -191,8 +193,8 @@ impl Outcome {
         let mut object = Map::new();
         object.insert("robot".to_owned(), json!(command.robot));
         object.insert("controller".to_owned(), json!(command.controller));
-        object.insert("model".to_owned(), json!(started.model));
-        object.insert("model_version".to_owned(), json!(started.model_version));
+        object.insert("model".to_owned(), json!(started.policy));
+        object.insert("model_version".to_owned(), json!(started.policy_version));
         object.insert("seed".to_owned(), json!(command.seed));
         object.insert("complete".to_owned(), json!(self.result.is_some()));
         object.insert("motions_read".to_owned(), json!(self.read));
@@ -221,8 +223,8 @@ impl Outcome {
     fn print(&self, command: &Evaluate, started: &EvaluationStarted) {
         let EvaluationStarted {
             robot,
-            model,
-            model_version,
+            policy: model,
+            policy_version: model_version,
             episodes,
             ..
         } = started;
@@ -259,7 +261,7 @@ impl Outcome {
             println!(
                 "  failed: {} after {:.2} s ({}): {}",
                 episode.clip,
-                episode.failure_time,
+                episode.failure_time(),
                 source(episode),
                 episode.reason
             );
@@ -409,8 +411,8 @@ fn end(episode: &EpisodeResult) -> &'static str {
 
 /// Writes one row an episode to a temporary name beside `path`, which then appears whole.
 fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
-    let file = atomic::temporary(path)?;
-    let mut csv = Writer::from_writer(file.reopen()?);
+    let file = AtomicFile::create(path)?;
+    let mut csv = Writer::from_writer(file.handle()?);
     csv.write_record([
         "episode",
         "clip",
@@ -439,7 +441,9 @@ fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
             source(episode).to_owned(),
             episode.frames.to_string(),
             end(episode).to_owned(),
-            format!("{:.2}", episode.failure_time),
+            episode
+                .failure_time
+                .map_or_else(String::new, |time| format!("{time:.2}")),
             episode.reason.clone(),
         ];
         let values = [
@@ -459,7 +463,7 @@ fn write_csv(path: &Path, episodes: &[EpisodeResult]) -> anyhow::Result<()> {
         csv.write_record(row)?;
     }
     csv.flush()?;
-    Ok(atomic::persist(file, path)?)
+    Ok(file.finish()?)
 }
 
 #[cfg(test)]
@@ -473,7 +477,7 @@ mod tests {
             source: ClipSource::Recorded.into(),
             frames,
             end: end.into(),
-            failure_time: 1.5,
+            failure_time: Some(1.5),
             reason: "the base tilted too far".to_owned(),
             metrics: Some(EpisodeMetrics {
                 mjp: f64::from(number),

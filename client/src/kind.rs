@@ -4,9 +4,9 @@ use std::future::Future;
 
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{
-    Delivery, DroppedFrame, FilterResult, FrameHeader, PolicyResult, RetargetFrame, RetargetResult,
-    StreamFilterGoalRequest, StreamFilterGoalResponse, StreamPolicyRequest, StreamPolicyResponse,
-    StreamRetargetRequest, StreamRetargetResponse, Timing,
+    Delivery, DroppedFrame, FilterResult, FrameHeader, GoingAway, PolicyResult, RetargetFrame,
+    RetargetResult, StreamFilterGoalRequest, StreamFilterGoalResponse, StreamPolicyRequest,
+    StreamPolicyResponse, StreamRetargetRequest, StreamRetargetResponse, Timing,
     motion_service_client::MotionServiceClient, stream_filter_goal_request,
     stream_filter_goal_response, stream_policy_request, stream_policy_response,
     stream_retarget_request, stream_retarget_response,
@@ -31,12 +31,17 @@ pub(crate) trait Kind: Clone + Send + Sync + 'static {
     /// The first message.
     fn first(&self) -> Self::Request;
 
-    fn delivery(&self) -> Delivery;
+    /// Whether a frame that has no answer is worth sending again on another connection: a person's motion, not what a robot
+    /// measured a while ago.
+    fn resends(&self) -> bool;
 
-    fn frame(header: FrameHeader, frame: &Self::Frame) -> Self::Request;
+    /// The stream was accepted, with what it needs to be taken up again.
+    fn accepted(&mut self, _started: &Started) {}
+
+    fn frame(&self, header: FrameHeader, frame: &Self::Frame) -> Self::Request;
 
     fn call(
-        service: MotionServiceClient<Channel>,
+        channel: Channel,
         requests: ReceiverStream<Self::Request>,
     ) -> impl Future<Output = Result<Streaming<Self::Response>, Status>> + Send;
 
@@ -54,10 +59,16 @@ pub(crate) enum Incoming<K: Kind> {
         timing: Option<Timing>,
     },
     Dropped(DroppedFrame),
+    /// The server is being stopped.
+    GoingAway(GoingAway),
+    /// Nothing that a stream tells.
+    Other,
 }
 
 /// The stream was accepted.
 pub(crate) struct Started {
+    /// What takes this stream's seat over later; empty where it has none.
+    pub(crate) resume_token: String,
     pub(crate) model: String,
     pub(crate) model_version: String,
     pub(crate) joint_names: Vec<String>,
@@ -79,11 +90,11 @@ impl Kind for StreamConfig {
         StreamRetargetRequest { message }
     }
 
-    fn delivery(&self) -> Delivery {
-        self.delivery
+    fn resends(&self) -> bool {
+        self.delivery == Delivery::All
     }
 
-    fn frame(header: FrameHeader, frame: &KeyNodeFrame) -> StreamRetargetRequest {
+    fn frame(&self, header: FrameHeader, frame: &KeyNodeFrame) -> StreamRetargetRequest {
         let frame = RetargetFrame {
             header: Some(header),
             pose: Some(wire::pose(frame)),
@@ -93,9 +104,10 @@ impl Kind for StreamConfig {
     }
 
     async fn call(
-        mut service: MotionServiceClient<Channel>,
+        channel: Channel,
         requests: ReceiverStream<StreamRetargetRequest>,
     ) -> Result<Streaming<StreamRetargetResponse>, Status> {
+        let mut service = MotionServiceClient::new(channel);
         Ok(service.stream_retarget(requests).await?.into_inner())
     }
 
@@ -103,6 +115,7 @@ impl Kind for StreamConfig {
         use stream_retarget_response::Message;
         Some(match response.message? {
             Message::Started(started) => Incoming::Started(Started {
+                resume_token: String::new(),
                 model: started.model,
                 model_version: started.model_version,
                 joint_names: started.joint_names,
@@ -113,6 +126,7 @@ impl Kind for StreamConfig {
                 timing: message.timing,
             },
             Message::Dropped(message) => Incoming::Dropped(message),
+            Message::GoingAway(notice) => Incoming::GoingAway(notice),
         })
     }
 
@@ -133,20 +147,21 @@ impl Kind for PolicyConfig {
         StreamPolicyRequest { message }
     }
 
-    fn delivery(&self) -> Delivery {
-        self.delivery
+    fn resends(&self) -> bool {
+        false
     }
 
-    fn frame(header: FrameHeader, frame: &RobotFrame) -> StreamPolicyRequest {
+    fn frame(&self, header: FrameHeader, frame: &RobotFrame) -> StreamPolicyRequest {
         let frame = wire::robot_frame(header, frame);
         let message = Some(stream_policy_request::Message::Frame(frame));
         StreamPolicyRequest { message }
     }
 
     async fn call(
-        mut service: MotionServiceClient<Channel>,
+        channel: Channel,
         requests: ReceiverStream<StreamPolicyRequest>,
     ) -> Result<Streaming<StreamPolicyResponse>, Status> {
+        let mut service = MotionServiceClient::new(channel);
         Ok(service.stream_policy(requests).await?.into_inner())
     }
 
@@ -154,6 +169,7 @@ impl Kind for PolicyConfig {
         use stream_policy_response::Message;
         Some(match response.message? {
             Message::Started(started) => Incoming::Started(Started {
+                resume_token: String::new(),
                 model: started.model,
                 model_version: started.model_version,
                 joint_names: [started.goal_joint_names, started.leg_joint_names].concat(),
@@ -164,6 +180,7 @@ impl Kind for PolicyConfig {
                 timing: message.timing,
             },
             Message::Dropped(message) => Incoming::Dropped(message),
+            Message::GoingAway(notice) => Incoming::GoingAway(notice),
         })
     }
 
@@ -184,20 +201,21 @@ impl Kind for FilterConfig {
         StreamFilterGoalRequest { message }
     }
 
-    fn delivery(&self) -> Delivery {
-        self.delivery
+    fn resends(&self) -> bool {
+        false
     }
 
-    fn frame(header: FrameHeader, frame: &GoalFrame) -> StreamFilterGoalRequest {
+    fn frame(&self, header: FrameHeader, frame: &GoalFrame) -> StreamFilterGoalRequest {
         let frame = wire::goal_frame(header, frame);
         let message = Some(stream_filter_goal_request::Message::Frame(frame));
         StreamFilterGoalRequest { message }
     }
 
     async fn call(
-        mut service: MotionServiceClient<Channel>,
+        channel: Channel,
         requests: ReceiverStream<StreamFilterGoalRequest>,
     ) -> Result<Streaming<StreamFilterGoalResponse>, Status> {
+        let mut service = MotionServiceClient::new(channel);
         Ok(service.stream_filter_goal(requests).await?.into_inner())
     }
 
@@ -205,6 +223,7 @@ impl Kind for FilterConfig {
         use stream_filter_goal_response::Message;
         Some(match response.message? {
             Message::Started(started) => Incoming::Started(Started {
+                resume_token: String::new(),
                 model: started.model,
                 model_version: started.model_version,
                 joint_names: [started.goal_joint_names, started.leg_joint_names].concat(),
@@ -215,6 +234,7 @@ impl Kind for FilterConfig {
                 timing: message.timing,
             },
             Message::Dropped(message) => Incoming::Dropped(message),
+            Message::GoingAway(notice) => Incoming::GoingAway(notice),
         })
     }
 

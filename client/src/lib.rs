@@ -32,6 +32,7 @@
 mod backoff;
 mod client;
 mod connection;
+mod controller;
 mod driver;
 mod error;
 mod kind;
@@ -44,14 +45,20 @@ mod wire;
 
 pub use backoff::Backoff;
 pub use client::Client;
+pub use controller::{ControllerError, controller};
 pub use emp_proto::v1::{
-    ChangeReason, ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig,
-    CollectStarted, Delivery, DropReason, EmpMode, EpisodeEnd, EpisodeFinished, EpisodeMetrics,
-    EpisodeResult, EvaluateConfig, EvaluationMetrics, EvaluationResult, EvaluationStarted,
-    FilterResult, GoalClip, GoalPhase, GoalStatistics, GuardReport, Joint, KeyNode, MassRange,
-    Metric, Model, ModelKind, PoseReport, ProceduralClips, Push, RampCause, Randomization, Robot,
-    RolloutBlock, Spread, StepEnd, TeleoperatedFrame, TeleoperationPresence, TeleoperationStarted,
-    Timing, TrainingEnd, evaluate_response::Message as EvaluationEvent,
+    AddedMass, ChangeReason, ClipSource, CollectFinished, CollectRequest, CollectRolloutsConfig,
+    CollectStarted, ControlCommand, ControlRequest, ControlResponse, Controller,
+    ControllerDescription, Delivery, DropReason, EmpMode, EnvironmentRandomization,
+    EnvironmentSettings, EpisodeEnd, EpisodeFinished, EpisodeMetrics, EpisodeResult,
+    EvaluationConfig, EvaluationMetrics, EvaluationResult, EvaluationStarted, FilterResult,
+    GetServerInfoResponse as ServerInfo, GoalClip, GoalPhase, GoalStatistics, GoingAway,
+    GuardReport, Hang, Job, JobKind, JobState, Joint, KeyNode, Link, MassRange, Metric, Model,
+    ModelKind, PoseReport, ProceduralClips, Push, RampCause, Randomization, Range, ReloadedModel,
+    RewardWeight, Robot, RobotMass, RobotSummary, RolloutBlock, Session, SessionPresence,
+    SessionState, Spread, StepEnd, TeleoperatedFrame, TeleoperationStarted, Timing, TrainingEnd,
+    TrainingEpisode, TrainingPush, added_mass::Choice as MassChoice,
+    watch_evaluation_response::Message as EvaluationEvent,
 };
 pub use error::ClientError;
 pub use rollouts::{Collection, Evaluation};
@@ -64,6 +71,6 @@ pub use stream::{
     StreamEvents,
 };
 pub use teleoperation::{
-    PoseSender, SessionEvent, SessionEvents, TeleoperationAnswer, TeleoperationConfig,
-    TeleoperationFrame,
+    OperatorInput, PoseSender, SessionEvent, SessionEvents, TeleoperationAnswer,
+    TeleoperationConfig, TeleoperationFrame,
 };

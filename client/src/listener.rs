@@ -4,8 +4,7 @@
 use std::time::Instant;
 
 use emp_proto::v1::{
-    TeleoperateRequest, TeleoperateResponse, TeleoperationRole, TeleoperationStarted,
-    motion_service_client::MotionServiceClient, teleoperate_response::Message,
+    TeleoperateRequest, TeleoperateResponse, TeleoperationStarted, teleoperate_response::Message,
 };
 use tokio::{sync::mpsc, time::sleep_until};
 use tonic::{Status, transport::Channel};
@@ -14,30 +13,35 @@ use crate::{
     Backoff, ClientError, PoseSender, SessionEvent, SessionEvents, TeleoperationConfig,
     backoff::Break,
     connection::{self, Attempts, EVENTS, End, HAND_OVER},
-    teleoperation, wire,
+    teleoperation::{self, Role},
+    wire,
 };
 
 /// Joins a session and starts the stream's driver.
 pub(crate) async fn start(
-    service: MotionServiceClient<Channel>,
+    channel: Channel,
     config: TeleoperationConfig,
-    role: TeleoperationRole,
+    role: Role,
     backoff: Backoff,
 ) -> Result<(PoseSender, SessionEvents), ClientError> {
-    let (poses, from_program) = mpsc::channel(HAND_OVER);
+    let (frames, from_program) = mpsc::channel(HAND_OVER);
     let (to_program, events) = mpsc::channel(EVENTS);
-    let listener = Listener {
-        service,
+    let mut listener = Listener {
+        channel,
         config,
         role,
         backoff,
-        poses: from_program,
+        frames: from_program,
         events: to_program,
     };
     let (connection, started) = listener.open().await?;
+    listener
+        .config
+        .resume_token
+        .clone_from(&started.resume_token);
     tokio::spawn(listener.run(connection));
     let sender = PoseSender {
-        poses,
+        frames,
         next_number: 0,
     };
     Ok((sender, SessionEvents { started, events }))
@@ -47,17 +51,17 @@ pub(crate) async fn start(
 type Connection = connection::Connection<TeleoperateRequest, TeleoperateResponse>;
 
 struct Listener {
-    service: MotionServiceClient<Channel>,
+    channel: Channel,
     config: TeleoperationConfig,
-    role: TeleoperationRole,
+    role: Role,
     backoff: Backoff,
-    poses: mpsc::Receiver<TeleoperateRequest>,
+    frames: mpsc::Receiver<TeleoperateRequest>,
     events: mpsc::Sender<Result<SessionEvent, ClientError>>,
 }
 
 impl Listener {
     async fn open(&self) -> Result<(Connection, TeleoperationStarted), Break> {
-        let call = |requests| teleoperation::call(self.service.clone(), requests);
+        let call = |requests| teleoperation::call(self.channel.clone(), requests);
         let started = |response: TeleoperateResponse| match response.message {
             Some(Message::Started(started)) => Some(started),
             _ => None,
@@ -66,12 +70,18 @@ impl Listener {
     }
 
     async fn run(mut self, mut connection: Connection) {
+        let mut attempts: Option<Attempts> = None;
         let end = loop {
+            let since = Instant::now();
             match self.converse(connection).await {
-                End::Broken(end) if end.is_worth_retrying() => match self.reconnect(end).await {
-                    Ok(new) => connection = new,
-                    Err(end) => break end,
-                },
+                End::Broken(end) if end.is_worth_retrying() => {
+                    let next = Attempts::after(end, self.backoff, attempts.take(), since.elapsed());
+                    let next = attempts.insert(next);
+                    match self.reconnect(next).await {
+                        Ok(new) => connection = new,
+                        Err(end) => break end,
+                    }
+                }
                 end => break end,
             }
         };
@@ -82,13 +92,13 @@ impl Listener {
     }
 
     async fn converse(&mut self, mut connection: Connection) -> End {
-        let is_operator = self.role == TeleoperationRole::Operator;
+        let is_operator = self.role == Role::Operator;
         loop {
             let may_send = is_operator && connection.requests.is_some();
             let response = tokio::select! {
                 () = self.events.closed() => return End::Abandoned,
                 response = connection.responses.message() => response,
-                pose = self.poses.recv(), if may_send => {
+                pose = self.frames.recv(), if may_send => {
                     // Without a pose the operator has left; a transport that is gone says why in the responses.
                     let gone = match (pose, &connection.requests) {
                         (Some(pose), Some(requests)) => requests.send(pose).await.is_err(),
@@ -123,6 +133,9 @@ impl Listener {
             Some(Message::Result(result)) => SessionEvent::Executed(Box::new(result)),
             Some(Message::Presence(presence)) => SessionEvent::Presence(presence),
             Some(Message::Dropped(dropped)) => SessionEvent::Dropped(wire::dropped(dropped)),
+            Some(Message::GoingAway(notice)) => SessionEvent::GoingAway {
+                grace: wire::duration(notice.grace),
+            },
             Some(Message::Started(_)) => return Err(End::contract("a stream that starts twice")),
             None => return Err(End::Failed(ClientError::EMPTY_MESSAGE)),
         };
@@ -136,8 +149,7 @@ impl Listener {
     }
 
     /// Restores the connection, or says why it cannot be.
-    async fn reconnect(&mut self, last: Break) -> Result<Connection, End> {
-        let mut attempts = Attempts::after(last, self.backoff);
+    async fn reconnect(&mut self, attempts: &mut Attempts) -> Result<Connection, End> {
         loop {
             let (reason, attempt, retry_in) = attempts.another()?;
             self.tell(SessionEvent::ConnectionLost {
@@ -149,6 +161,7 @@ impl Listener {
             self.wait(Instant::now() + retry_in).await?;
             match self.open().await {
                 Ok((connection, started)) => {
+                    self.config.resume_token = started.resume_token;
                     self.tell(SessionEvent::Reconnected).await?;
                     if let Some(presence) = started.presence {
                         self.tell(SessionEvent::Presence(presence)).await?;
@@ -166,7 +179,7 @@ impl Listener {
             tokio::select! {
                 () = sleep_until(until.into()) => return Ok(()),
                 () = self.events.closed() => return Err(End::Abandoned),
-                pose = self.poses.recv(), if self.role == TeleoperationRole::Operator => {
+                pose = self.frames.recv(), if self.role == Role::Operator => {
                     if pose.is_none() {
                         return Err(End::Finished);
                     }

@@ -1,6 +1,6 @@
 //! What the server has, as tables or JSON.
 
-use std::{collections::BTreeSet, process::ExitCode};
+use std::process::ExitCode;
 
 use emp_client::{Client, Joint, Model, Robot};
 use serde_json::{Value, json};
@@ -23,15 +23,13 @@ pub(crate) async fn models(client: &Client, as_json: bool) -> anyhow::Result<Exi
 }
 
 pub(crate) async fn robots(client: &Client, as_json: bool) -> anyhow::Result<ExitCode> {
-    let names: BTreeSet<String> = client
-        .models()
-        .await?
-        .into_iter()
-        .map(|model| model.robot)
-        .collect();
     let mut robots = Vec::new();
-    for name in names {
-        robots.push(client.robot(&name).await?);
+    for summary in client.robots().await? {
+        if summary.serving {
+            robots.push(client.robot(&summary.name).await?);
+        } else {
+            eprintln!("emp: {} is not served: {}", summary.name, summary.reason);
+        }
     }
     if as_json {
         println!("{}", Value::from_iter(robots.iter().map(robot_json)));
@@ -64,8 +62,7 @@ fn print_robot(robot: &Robot) {
 }
 
 fn model_json(model: &Model) -> Value {
-    // The server sends JSON here; anything else stands as it is.
-    let training = serde_json::from_str(&model.training).unwrap_or_else(|_| json!(model.training));
+    let training = model.training.as_ref().map(struct_json);
     json!({
         "name": model.name,
         "version": model.version,
@@ -76,6 +73,23 @@ fn model_json(model: &Model) -> Value {
         "git_revision": model.git_revision,
         "training": training,
     })
+}
+
+fn struct_json(object: &prost_types::Struct) -> Value {
+    let fields = object.fields.iter();
+    Value::from_iter(fields.map(|(key, value)| (key.clone(), value_json(value))))
+}
+
+fn value_json(value: &prost_types::Value) -> Value {
+    use prost_types::value::Kind;
+    match &value.kind {
+        None | Some(Kind::NullValue(_)) => Value::Null,
+        Some(Kind::NumberValue(number)) => json!(number),
+        Some(Kind::StringValue(text)) => json!(text),
+        Some(Kind::BoolValue(value)) => json!(value),
+        Some(Kind::ListValue(list)) => Value::from_iter(list.values.iter().map(value_json)),
+        Some(Kind::StructValue(object)) => struct_json(object),
+    }
 }
 
 fn robot_json(robot: &Robot) -> Value {

@@ -47,6 +47,10 @@ pub(crate) async fn run(
         smoothing: command.smooth,
         ..StreamConfig::for_robot(&command.robot)
     };
+    let client = match command.realtime {
+        true => client.clone().with_backoff(command::LIVE),
+        false => client.clone(),
+    };
     let (sender, mut events) = client.stream(config).await?;
     let mut table = JointCsvWriter::create(&command.out, events.joint_names())?;
     let frames = clip.frames.len() as u64;
@@ -124,6 +128,9 @@ async fn receive(
                 attempt,
                 retry_in,
             } => bar.suspend(|| command::say_lost(&reason, attempt, retry_in)),
+            Event::GoingAway { .. } => {
+                bar.suspend(|| eprintln!("emp: the server is being stopped"))
+            }
             Event::Reconnected { resent } => bar.suspend(|| {
                 eprintln!("emp: reconnected; {resent} frames sent again");
             }),

@@ -3,10 +3,11 @@
 use emp_motion::Clip;
 use emp_proto::v1::{
     CollectFinished, CollectRequest, CollectRolloutsConfig, CollectRolloutsRequest,
-    CollectRolloutsResponse, CollectStarted, EnvironmentSnapshot, EvaluateConfig, EvaluateRequest,
-    EvaluateResponse, GoalClip, MotionClip, MotionPoses, RolloutBlock, SnapshotRequest,
-    collect_rollouts_request, collect_rollouts_response, evaluate_request, evaluate_response,
-    rollout_service_client::RolloutServiceClient,
+    CollectRolloutsResponse, CollectStarted, EnvironmentSnapshot, EvaluationConfig, GoalClip,
+    MotionClip, MotionPoses, PolicyPart, RolloutBlock, SnapshotRequest, StartEvaluationRequest,
+    WatchEvaluationRequest, WatchEvaluationResponse, collect_rollouts_request,
+    collect_rollouts_response, rollout_service_client::RolloutServiceClient,
+    start_evaluation_request, watch_evaluation_response,
 };
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -14,76 +15,108 @@ use tonic::{Streaming, transport::Channel};
 
 use crate::{ClientError, wire};
 
-/// Largest message of a job.
-const MAX_MESSAGE: usize = 16 << 20;
 /// Poses in one message; a pose takes about 200 bytes.
-const POSES: usize = 4096;
+const POSES: usize = 2048;
 /// Messages between the program and the transport.
 const HAND_OVER: usize = 4;
-/// Bytes of a snapshot in one message.
-const SNAPSHOT_PART: usize = 4 << 20;
+/// Bytes of a snapshot or a policy in one message, which is below 1 MiB.
+const PART: usize = (1 << 20) - 64;
 
 const OTHER_REQUEST: ClientError = ClientError::Contract("an answer to another request");
 
 fn service(channel: Channel) -> RolloutServiceClient<Channel> {
-    RolloutServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE)
+    RolloutServiceClient::new(channel)
 }
 
-/// A running evaluation. Dropping it cancels the job.
+/// An evaluation that is watched. The job goes on without its watchers; [`Client::cancel_job`](crate::Client::cancel_job) ends it.
 #[derive(Debug)]
 pub struct Evaluation {
-    responses: Streaming<EvaluateResponse>,
+    job: String,
+    next_event: u64,
+    responses: Streaming<WatchEvaluationResponse>,
 }
 
 impl Evaluation {
     pub(crate) async fn start(
         channel: Channel,
-        config: EvaluateConfig,
+        config: EvaluationConfig,
         motions: Vec<Clip>,
     ) -> Result<Self, ClientError> {
+        use start_evaluation_request::Message;
         let (requests, outbound) = mpsc::channel(HAND_OVER);
-        // The responses say why a call ended that takes no more motions.
+        // The answer says why a call ended that takes no more motions.
         tokio::spawn(async move {
-            let messages = std::iter::once(evaluate_request::Message::Config(config))
-                .chain(motions.iter().flat_map(messages));
+            let messages =
+                std::iter::once(Message::Config(config)).chain(motions.iter().flat_map(messages));
             for message in messages {
                 let message = Some(message);
-                if requests.send(EvaluateRequest { message }).await.is_err() {
+                let request = StartEvaluationRequest { message };
+                if requests.send(request).await.is_err() {
                     return;
                 }
             }
         });
-        let response = service(channel)
-            .evaluate(ReceiverStream::new(outbound))
+        let response = service(channel.clone())
+            .start_evaluation(ReceiverStream::new(outbound))
             .await?;
+        Self::watch(channel, response.into_inner().job, 0).await
+    }
+
+    pub(crate) async fn watch(
+        channel: Channel,
+        job: String,
+        first_event: u64,
+    ) -> Result<Self, ClientError> {
+        let request = WatchEvaluationRequest {
+            job: job.clone(),
+            first_event,
+        };
+        let response = service(channel).watch_evaluation(request).await?;
         Ok(Self {
+            job,
+            next_event: first_event,
             responses: response.into_inner(),
         })
+    }
+
+    /// The job's id.
+    pub fn job(&self) -> &str {
+        &self.job
+    }
+
+    /// Number of the next event: where a watcher goes on that was cut off.
+    pub fn next_event(&self) -> u64 {
+        self.next_event
     }
 
     /// The next message; none after the result.
     ///
     /// # Errors
     /// When the evaluation ended before its result.
-    pub async fn next(&mut self) -> Result<Option<evaluate_response::Message>, ClientError> {
+    pub async fn next(
+        &mut self,
+    ) -> Result<Option<watch_evaluation_response::Message>, ClientError> {
         match self.responses.message().await? {
-            Some(response) => response.message.map(Some).ok_or(ClientError::EMPTY_MESSAGE),
+            Some(response) => {
+                self.next_event = response.event + 1;
+                response.message.map(Some).ok_or(ClientError::EMPTY_MESSAGE)
+            }
             None => Ok(None),
         }
     }
 }
 
 /// A motion in messages below the limit.
-fn messages(clip: &Clip) -> impl Iterator<Item = evaluate_request::Message> + use<'_> {
+fn messages(clip: &Clip) -> impl Iterator<Item = start_evaluation_request::Message> + use<'_> {
+    use start_evaluation_request::Message;
     let poses = |frames: &[emp_motion::KeyNodeFrame]| frames.iter().map(wire::pose).collect();
     let mut parts = clip.frames.chunks(POSES);
-    let first = evaluate_request::Message::Clip(MotionClip {
+    let first = Message::Clip(MotionClip {
         name: clip.name.clone(),
         fps: clip.fps,
         poses: parts.next().map(poses).unwrap_or_default(),
     });
-    let rest =
-        parts.map(move |part| evaluate_request::Message::Poses(MotionPoses { poses: poses(part) }));
+    let rest = parts.map(move |part| Message::Poses(MotionPoses { poses: poses(part) }));
     std::iter::once(first).chain(rest)
 }
 
@@ -143,16 +176,27 @@ impl Collection {
         &self.started
     }
 
-    /// Runs the robots; the blocks are those of all robots, in order.
+    /// Runs the robots with a policy, a file in the safetensors format; the blocks are those of all robots, in order.
     ///
     /// # Errors
     /// When the server refuses the request or the job ends.
     pub async fn collect(
         &mut self,
+        policy: &[u8],
         request: CollectRequest,
     ) -> Result<(Vec<RolloutBlock>, CollectFinished), ClientError> {
         use collect_rollouts_response::Message;
         let iteration = request.iteration;
+        let parts = policy.chunks(PART);
+        let last = parts.len().saturating_sub(1);
+        for (index, part) in parts.enumerate() {
+            let part = PolicyPart {
+                data: part.to_vec(),
+                last: index == last,
+            };
+            self.send(collect_rollouts_request::Message::Policy(part))
+                .await?;
+        }
         self.send(collect_rollouts_request::Message::Collect(request))
             .await?;
         let mut blocks = Vec::new();
@@ -195,7 +239,7 @@ impl Collection {
     /// # Errors
     /// When it does not fit, or the job ends.
     pub async fn restore(&mut self, snapshot: &[u8]) -> Result<(), ClientError> {
-        let parts = snapshot.chunks(SNAPSHOT_PART);
+        let parts = snapshot.chunks(PART);
         let last = parts.len().saturating_sub(1);
         for (index, part) in parts.enumerate() {
             let part = EnvironmentSnapshot {

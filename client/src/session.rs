@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, process::ExitCode, time::Duration};
 use anyhow::Context as _;
 use emp_client::{
     Client, EmpMode, GoalPhase, GuardReport, PoseSender, SessionEvent, SessionEvents,
-    TeleoperatedFrame, TeleoperationConfig, TeleoperationPresence,
+    SessionPresence, TeleoperatedFrame, TeleoperationConfig,
 };
 use emp_motion::Clip;
 use serde_json::{Value, json};
@@ -30,9 +30,10 @@ pub(crate) async fn operate(
     )
     .await?;
     let config = TeleoperationConfig {
-        emp_mode: command.emp_mode.map_or(EmpMode::Unspecified, EmpMode::from),
+        emp_mode: command.emp_mode.map(EmpMode::from),
         ..TeleoperationConfig::new(&command.robot, &command.session)
     };
+    let client = client.clone().with_backoff(command::LIVE);
     let (sender, mut events) = client.operate(config).await?;
     say_who_is_there(&events.started().presence.unwrap_or_default());
     tokio::spawn(send(clip, sender, rate));
@@ -61,7 +62,7 @@ pub(crate) async fn observe(
     }
     let listening = listen(&mut events, |result| {
         if as_json {
-            println!("{}", json_line(result));
+            println!("{}", json_line(result, &joints));
         } else {
             println!("{}", line(result, &joints));
         }
@@ -84,7 +85,7 @@ async fn send(clip: Clip, mut sender: PoseSender, rate: f64) {
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     for pose in &clip.frames {
         ticks.tick().await;
-        if sender.send(pose, EmpMode::Unspecified).await.is_err() {
+        if sender.send(pose).await.is_err() {
             return;
         }
     }
@@ -124,17 +125,25 @@ fn say(event: &SessionEvent) {
             attempt,
             retry_in,
         } => command::say_lost(reason, *attempt, *retry_in),
+        SessionEvent::GoingAway { grace } => eprintln!(
+            "emp: the server is being stopped; it serves on for {:.1} s",
+            grace.as_secs_f64()
+        ),
         SessionEvent::Reconnected => eprintln!("emp: reconnected"),
     }
 }
 
-fn say_who_is_there(presence: &TeleoperationPresence) {
+fn say_who_is_there(presence: &SessionPresence) {
     let there = |is_there| if is_there { "there" } else { "away" };
+    let robot = match presence.robot_silent {
+        true => "silent",
+        false => there(presence.robot),
+    };
     eprintln!(
-        "emp: robot {}, operator {}, {} observers",
-        there(presence.robot),
+        "emp: robot {robot}, operator {}, {} observers, {}",
         there(presence.operator),
-        presence.observers
+        presence.observers,
+        short(presence.state().as_str_name(), "SESSION_STATE_"),
     );
 }
 
@@ -173,28 +182,34 @@ fn line(result: &TeleoperatedFrame, joints: &[String]) -> String {
     let age = pose_age_ms(result).map_or_else(|| "-".to_owned(), |age| format!("{age:.0}"));
     let mode = short(result.emp_mode().as_str_name(), "EMP_MODE_");
     let guard = result.guard.clone().unwrap_or_default();
-    let goal = if guard.progress > 0.0 {
-        format!("{} {:.0} %", phase_name(result), 100.0 * guard.progress)
-    } else {
-        phase_name(result)
+    let goal = match guard.progress {
+        Some(progress) => format!("{} {:.0} %", phase_name(result), 100.0 * progress),
+        None => phase_name(result),
     };
     let filter = result.filter.clone().unwrap_or_default();
     let (index, change) = largest_change(result).unwrap_or_default();
     let joint = joints.get(index).map_or("", String::as_str);
     let danger = if filter.danger { "yes" } else { "no" };
+    let links = filter
+        .smallest_link_distance
+        .map_or_else(|| "-".to_owned(), |distance| format!("{distance:.3}"));
     format!(
-        "{number:<8}  {age:>7}  {mode:<11}  {goal:<20}  {change:>10.3}  {joint:<21}  {danger:<6}  {:>7.3}  {:>7.3}",
-        filter.center_of_mass_margin, filter.smallest_link_distance
+        "{number:<8}  {age:>7}  {mode:<11}  {goal:<20}  {change:>10.3}  {joint:<21}  {danger:<6}  {:>7.3}  {links:>7}",
+        filter.center_of_mass_margin
     )
 }
 
-fn json_line(result: &TeleoperatedFrame) -> Value {
+fn json_line(result: &TeleoperatedFrame, joints: &[String]) -> Value {
     let filter = result.filter.clone().unwrap_or_default();
     let guard = result.guard.clone().unwrap_or_default();
     let reasons = filter
         .reasons()
         .map(|reason| short(reason.as_str_name(), "CHANGE_REASON_"));
+    let limited = guard.speed_limited_joints.iter();
+    let limited = limited.filter_map(|&joint| joints.get(joint as usize));
     json!({
+        "number": result.number,
+        "state": short(result.state().as_str_name(), "SESSION_STATE_"),
         "frame": result.header.unwrap_or_default().sequence_number,
         "pose": result.pose.as_ref().map(|pose| pose.header.unwrap_or_default().sequence_number),
         "pose_age_ms": pose_age_ms(result),
@@ -202,7 +217,10 @@ fn json_line(result: &TeleoperatedFrame) -> Value {
         "phase": phase_name(result),
         "progress": guard.progress,
         "emp_progress": guard.emp_progress,
-        "speed_limited_joints": guard.speed_limited_joints,
+        "speed_limited_joints": limited.collect::<Vec<_>>(),
+        "state_frozen": guard.state_frozen,
+        "robot_frames_lost": result.robot_frames_lost,
+        "operator_frames_lost": result.operator_frames_lost,
         "goal": result.goal,
         "executable_goal": filter.executable_goal,
         "regloss": filter.regloss,

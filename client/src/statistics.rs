@@ -160,7 +160,7 @@ impl Statistics {
             }
             Event::Dropped(dropped) => *self.dropped.entry(dropped.cause.name()).or_default() += 1,
             Event::Reconnected { .. } => self.reconnects += 1,
-            Event::ConnectionLost { .. } => {}
+            Event::ConnectionLost { .. } | Event::GoingAway { .. } => {}
         }
     }
 
@@ -252,11 +252,7 @@ mod tests {
                 sequence_number: number,
                 joint_angles: Vec::new(),
                 direction_error: 0.1,
-                joints_at_limit: if number < 25 {
-                    vec!["waist".to_owned()]
-                } else {
-                    Vec::new()
-                },
+                joints_at_limit: if number < 25 { vec![0] } else { Vec::new() },
                 times: AnswerTimes {
                     queue_time: Duration::from_micros(10),
                     inference_time: Duration::from_micros(200),

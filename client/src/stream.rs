@@ -65,19 +65,19 @@ pub struct PolicyConfig {
     pub model_version: String,
     /// Whether every frame is computed, or only the newest.
     pub delivery: Delivery,
-    /// When the robot's EMP changes goals before the policy sees them; unspecified for never.
+    /// When the robot's EMP changes goals before the policy sees them; unspecified for always, where it has one.
     pub emp_mode: EmpMode,
 }
 
 impl PolicyConfig {
-    /// Every frame, with the robot's own policy, goals as they are sent.
+    /// The newest frame, with the robot's own policy, goals changed by its EMP where it has one.
     pub fn for_robot(robot: impl Into<String>) -> Self {
         Self {
             robot: robot.into(),
             model: String::new(),
             model_version: String::new(),
-            delivery: Delivery::All,
-            emp_mode: EmpMode::Off,
+            delivery: Delivery::Latest,
+            emp_mode: EmpMode::Unspecified,
         }
     }
 
@@ -108,13 +108,13 @@ pub struct FilterConfig {
 }
 
 impl FilterConfig {
-    /// Every frame, always with the robot's own EMP.
+    /// The newest frame, always with the robot's own EMP.
     pub fn for_robot(robot: impl Into<String>) -> Self {
         Self {
             robot: robot.into(),
             model: String::new(),
             model_version: String::new(),
-            delivery: Delivery::All,
+            delivery: Delivery::Latest,
             emp_mode: EmpMode::On,
         }
     }
@@ -221,8 +221,8 @@ pub struct Answer {
     pub joint_angles: Vec<f32>,
     /// Mean angle between the person's and the robot's arm bones, radians.
     pub direction_error: f32,
-    /// Names of the joints that stand at a limit.
-    pub joints_at_limit: Vec<String>,
+    /// The goal joints that stand at a limit, by their places.
+    pub joints_at_limit: Vec<u32>,
     /// Where the time went.
     pub times: AnswerTimes,
 }
@@ -245,7 +245,7 @@ pub struct Dropped {
 pub enum DropCause {
     /// The server said so.
     Server(DropReason),
-    /// It was on its way when the connection was lost, or sent while there was none (delivery `LATEST` only).
+    /// It was on its way when the connection was lost, or sent while there was none.
     ConnectionLost,
 }
 
@@ -280,9 +280,14 @@ pub enum Event<A = Answer> {
         /// When it comes.
         retry_in: Duration,
     },
+    /// The server is being stopped. A robot is served on for a while; a program that knows another server moves there.
+    GoingAway {
+        /// For how long.
+        grace: Duration,
+    },
     /// The connection stands again.
     Reconnected {
-        /// How many frames are sent again (delivery `ALL`).
+        /// How many frames are sent again: poses with delivery `ALL`.
         resent: usize,
     },
 }

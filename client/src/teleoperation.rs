@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{
-    self, Delivery, EmpMode, TeleoperateConfig, TeleoperateRequest, TeleoperateResponse,
-    TeleoperatedFrame, TeleoperationPresence, TeleoperationRole, TeleoperationStarted,
-    motion_service_client::MotionServiceClient, teleoperate_request::Message as Request,
-    teleoperate_response::Message as Response,
+    self, BothConfig, BothFrame, EmpMode, ObserverConfig, OperatorConfig, OperatorFrame,
+    RobotConfig, SessionPresence, TeleoperateConfig, TeleoperateRequest, TeleoperateResponse,
+    TeleoperatedFrame, TeleoperationStarted, teleoperate_config::Role as WireRole,
+    teleoperate_request::Message as Request, teleoperate_response::Message as Response,
+    teleoperation_service_client::TeleoperationServiceClient,
 };
 use nalgebra::UnitQuaternion;
 use tokio::sync::mpsc;
@@ -25,12 +26,10 @@ use crate::{
 pub struct TeleoperationConfig {
     /// Name of the session. Only a client with both ends may leave it empty: then nobody can join.
     pub session: String,
-    /// The robot's name; everyone in a session names the same.
+    /// The robot's name; everyone in a session names the same. An observer of an open session may leave it empty.
     pub robot: String,
-    /// Whether every frame of the robot is computed, or only the newest.
-    pub delivery: Delivery,
-    /// When the EMP changes goals; unspecified for what the session has.
-    pub emp_mode: EmpMode,
+    /// When the EMP changes goals; none for what the session has.
+    pub emp_mode: Option<EmpMode>,
     /// The policy's name; empty for the robot's own.
     pub policy: String,
     /// The version that the policy must have; empty for any.
@@ -43,38 +42,61 @@ pub struct TeleoperationConfig {
     pub refine: bool,
     /// Whether the goal is smoothed over time.
     pub smoothing: bool,
+    /// Whether a session that this robot opens begins as stopped, until it is armed.
+    pub start_stopped: bool,
+    /// Whether a client with both ends simulates its robot in step with the answers: the robot's own clock alone counts, and every
+    /// control period waits for its pose. Never for a real robot.
+    pub simulated: bool,
+    /// The token of the seat to take over, as [`SessionEvents::started`] had it; empty for a free seat.
+    pub resume_token: String,
 }
 
 impl TeleoperationConfig {
-    /// Every frame, with the robot's own models, refined and smoothed.
+    /// With the robot's own models, refined and smoothed.
     pub fn new(robot: impl Into<String>, session: impl Into<String>) -> Self {
         Self {
             session: session.into(),
             robot: robot.into(),
-            delivery: Delivery::All,
-            emp_mode: EmpMode::Unspecified,
+            emp_mode: None,
             policy: String::new(),
             policy_version: String::new(),
             retargeter: String::new(),
             retargeter_version: String::new(),
             refine: true,
             smoothing: true,
+            start_stopped: false,
+            simulated: false,
+            resume_token: String::new(),
         }
     }
 
-    pub(crate) fn request(&self, role: TeleoperationRole) -> TeleoperateRequest {
-        let config = TeleoperateConfig {
-            session: self.session.clone(),
-            role: role.into(),
-            robot: self.robot.clone(),
-            delivery: self.delivery.into(),
-            emp_mode: self.emp_mode.into(),
-            policy: self.policy.clone(),
-            policy_version: self.policy_version.clone(),
+    pub(crate) fn request(&self, role: Role) -> TeleoperateRequest {
+        let operator = || OperatorConfig {
             retargeter: self.retargeter.clone(),
             retargeter_version: self.retargeter_version.clone(),
             refine: self.refine,
             smoothing: self.smoothing,
+        };
+        let robot = || RobotConfig {
+            policy: self.policy.clone(),
+            policy_version: self.policy_version.clone(),
+            start_stopped: self.start_stopped,
+        };
+        let config = TeleoperateConfig {
+            session: self.session.clone(),
+            robot: self.robot.clone(),
+            emp_mode: self.emp_mode.map(i32::from),
+            resume_token: self.resume_token.clone(),
+            role: Some(match role {
+                Role::Operator => WireRole::Operator(operator()),
+                Role::Robot => WireRole::RobotEnd(robot()),
+                Role::Both => WireRole::Both(BothConfig {
+                    robot: Some(robot()),
+                    operator: Some(operator()),
+                    simulated: self.simulated,
+                }),
+                Role::Observer => WireRole::Observer(ObserverConfig {}),
+            }),
         };
         TeleoperateRequest {
             message: Some(Request::Config(config)),
@@ -82,19 +104,64 @@ impl TeleoperationConfig {
     }
 }
 
+/// Which end of a session a stream holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Role {
+    Operator,
+    Robot,
+    Both,
+    Observer,
+}
+
 /// One control period of a teleoperated robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TeleoperationFrame {
-    /// The person's pose, where the client holds that end too and has a newer one.
-    pub pose: Option<KeyNodeFrame>,
+    /// What the person does, where the client holds that end too and there is something new.
+    pub operator: Option<OperatorInput>,
     /// Angles of all joints, the goal joints before the leg joints, radians.
     pub joint_positions: Vec<f32>,
     /// Orientation of the base in a world frame with z up.
     pub orientation: UnitQuaternion<f64>,
+    /// When this was measured, on the robot's own steady clock, from any origin; none where the robot has none.
+    pub measured: Option<Duration>,
     /// Whether this is the first control period of an episode.
     pub reset: bool,
-    /// When the EMP changes goals from now on; unspecified for no change.
-    pub emp_mode: EmpMode,
+}
+
+/// What an operator sends.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct OperatorInput {
+    /// The person's pose.
+    pub pose: Option<KeyNodeFrame>,
+    /// Whether the person has let go of the robot, which holds its goal meanwhile.
+    pub clutch: bool,
+    /// Stops the session: the robot returns to its default pose until it is armed.
+    pub stop: bool,
+    /// The person faces forward in this pose.
+    pub recentre: bool,
+    /// When the EMP changes goals from now on; none for no change.
+    pub emp_mode: Option<EmpMode>,
+}
+
+impl OperatorInput {
+    /// A pose, and no more.
+    pub fn pose(pose: &KeyNodeFrame) -> Self {
+        Self {
+            pose: Some(pose.clone()),
+            ..Self::default()
+        }
+    }
+
+    fn message(&self, header: Option<v1::FrameHeader>) -> OperatorFrame {
+        OperatorFrame {
+            header,
+            pose: self.pose.as_ref().map(wire::pose),
+            clutch: self.clutch,
+            stop: self.stop,
+            recentre: self.recentre,
+            emp_mode: self.emp_mode.map(i32::from),
+        }
+    }
 }
 
 /// The answer to one control period.
@@ -113,10 +180,15 @@ pub struct TeleoperationAnswer {
 pub enum SessionEvent {
     /// A control period of the session's robot.
     Executed(Box<TeleoperatedFrame>),
-    /// Someone came or left.
-    Presence(TeleoperationPresence),
-    /// A pose of this operator is not used.
+    /// Someone came or left, or the session's state changed.
+    Presence(SessionPresence),
+    /// A frame of this operator is not used.
     Dropped(Dropped),
+    /// The server is being stopped.
+    GoingAway {
+        /// How long it serves on.
+        grace: Duration,
+    },
     /// The connection was lost, or an attempt to restore it failed. Poses that are sent meanwhile are lost.
     ConnectionLost {
         /// What the transport or the server said.
@@ -133,31 +205,30 @@ pub enum SessionEvent {
 /// An operator's sending end. Dropping it leaves the session.
 #[derive(Debug)]
 pub struct PoseSender {
-    pub(crate) poses: mpsc::Sender<TeleoperateRequest>,
+    pub(crate) frames: mpsc::Sender<TeleoperateRequest>,
     pub(crate) next_number: u64,
 }
 
 impl PoseSender {
-    /// Sends a pose, with another mode of the EMP unless that is unspecified, and gives its number: 0, 1, 2 …
+    /// Sends a pose and gives its number: 0, 1, 2 …
     ///
     /// # Errors
     /// When the stream has ended.
-    pub async fn send(
-        &mut self,
-        pose: &KeyNodeFrame,
-        emp_mode: EmpMode,
-    ) -> Result<u64, StreamClosed> {
+    pub async fn send(&mut self, pose: &KeyNodeFrame) -> Result<u64, StreamClosed> {
+        self.send_input(&OperatorInput::pose(pose)).await
+    }
+
+    /// Sends a pose, or commands, or both, and gives the frame's number.
+    ///
+    /// # Errors
+    /// When the stream has ended.
+    pub async fn send_input(&mut self, input: &OperatorInput) -> Result<u64, StreamClosed> {
         let number = self.next_number;
-        let frame = v1::TeleoperationFrame {
-            header: Some(wire::header(number, None)),
-            pose: Some(wire::pose(pose)),
-            emp_mode: emp_mode.into(),
-            ..v1::TeleoperationFrame::default()
-        };
+        let frame = input.message(Some(wire::header(number, None)));
         let request = TeleoperateRequest {
-            message: Some(Request::Frame(frame)),
+            message: Some(Request::Operator(frame)),
         };
-        self.poses.send(request).await.map_err(|_| StreamClosed)?;
+        self.frames.send(request).await.map_err(|_| StreamClosed)?;
         self.next_number += 1;
         Ok(number)
     }
@@ -189,13 +260,14 @@ impl SessionEvents {
 #[derive(Debug, Clone)]
 pub(crate) struct RobotEnd {
     pub(crate) config: TeleoperationConfig,
-    pub(crate) role: TeleoperationRole,
+    pub(crate) role: Role,
 }
 
 pub(crate) async fn call(
-    mut service: MotionServiceClient<Channel>,
+    channel: Channel,
     requests: ReceiverStream<TeleoperateRequest>,
 ) -> Result<Streaming<TeleoperateResponse>, Status> {
+    let mut service = TeleoperationServiceClient::new(channel);
     Ok(service.teleoperate(requests).await?.into_inner())
 }
 
@@ -210,46 +282,59 @@ impl Kind for RobotEnd {
         self.config.request(self.role)
     }
 
-    fn delivery(&self) -> Delivery {
-        self.config.delivery
+    fn resends(&self) -> bool {
+        false
     }
 
-    fn frame(header: v1::FrameHeader, frame: &TeleoperationFrame) -> TeleoperateRequest {
-        let frame = v1::TeleoperationFrame {
+    fn accepted(&mut self, started: &Started) {
+        self.config.resume_token.clone_from(&started.resume_token);
+    }
+
+    fn frame(&self, header: v1::FrameHeader, frame: &TeleoperationFrame) -> TeleoperateRequest {
+        let (positions, orientation) = (&frame.joint_positions, &frame.orientation);
+        let robot = v1::RobotFrame {
             header: Some(header),
-            pose: frame.pose.as_ref().map(wire::pose),
-            state: Some(wire::state(&frame.joint_positions, &frame.orientation)),
+            state: Some(wire::state(positions, orientation, frame.measured)),
             reset: frame.reset,
-            emp_mode: frame.emp_mode.into(),
+        };
+        let operator = frame.operator.as_ref();
+        let message = match self.role {
+            Role::Both => Request::Both(BothFrame {
+                robot: Some(robot),
+                operator: operator.map(|operator| operator.message(None)),
+            }),
+            _ => Request::Robot(robot),
         };
         TeleoperateRequest {
-            message: Some(Request::Frame(frame)),
+            message: Some(message),
         }
     }
 
     async fn call(
-        service: MotionServiceClient<Channel>,
+        channel: Channel,
         requests: ReceiverStream<TeleoperateRequest>,
     ) -> Result<Streaming<TeleoperateResponse>, Status> {
-        call(service, requests).await
+        call(channel, requests).await
     }
 
     fn sort(response: TeleoperateResponse) -> Option<Incoming<Self>> {
-        match response.message? {
-            Response::Started(started) => Some(Incoming::Started(Started {
+        Some(match response.message? {
+            Response::Started(started) => Incoming::Started(Started {
+                resume_token: started.resume_token,
                 model: started.policy,
                 model_version: started.policy_version,
                 joint_names: [started.goal_joint_names, started.leg_joint_names].concat(),
-            })),
-            Response::Result(result) => Some(Incoming::Result {
+            }),
+            Response::Result(result) => Incoming::Result {
                 number: result.header.unwrap_or_default().sequence_number,
                 timing: result.timing,
                 result: Some(result),
-            }),
-            Response::Dropped(message) => Some(Incoming::Dropped(message)),
-            // Only listeners are told who comes and goes.
-            Response::Presence(_) => None,
-        }
+            },
+            Response::Dropped(message) => Incoming::Dropped(message),
+            Response::GoingAway(notice) => Incoming::GoingAway(notice),
+            // Listeners are told who comes and goes.
+            Response::Presence(_) => Incoming::Other,
+        })
     }
 
     fn answer(number: u64, result: TeleoperatedFrame, times: AnswerTimes) -> TeleoperationAnswer {

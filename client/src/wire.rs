@@ -31,6 +31,7 @@ pub(crate) fn pose(frame: &KeyNodeFrame) -> v1::HumanPose {
         right_wrist: position(KeyNode::RightWrist),
         left_wrist_orientation: left.as_ref().map(hand),
         right_wrist_orientation: right.as_ref().map(hand),
+        ..v1::HumanPose::default()
     }
 }
 
@@ -59,16 +60,16 @@ pub(crate) fn header(sequence_number: u64, time_budget: Option<Duration>) -> v1:
 pub(crate) fn robot_frame(header: v1::FrameHeader, frame: &RobotFrame) -> v1::PolicyFrame {
     v1::PolicyFrame {
         header: Some(header),
-        state: Some(state(&frame.joint_positions, &frame.orientation)),
+        state: Some(state(&frame.joint_positions, &frame.orientation, None)),
         goal: frame.goal.clone(),
         reset: frame.reset,
     }
 }
 
-pub(crate) fn goal_frame(header: v1::FrameHeader, frame: &GoalFrame) -> v1::FilterFrame {
-    v1::FilterFrame {
+pub(crate) fn goal_frame(header: v1::FrameHeader, frame: &GoalFrame) -> v1::FilterGoalFrame {
+    v1::FilterGoalFrame {
         header: Some(header),
-        state: Some(state(&frame.joint_positions, &frame.orientation)),
+        state: Some(state(&frame.joint_positions, &frame.orientation, None)),
         goal: frame.goal.clone(),
         last_action: frame.last_action.clone(),
         reset: frame.reset,
@@ -77,16 +78,23 @@ pub(crate) fn goal_frame(header: v1::FrameHeader, frame: &GoalFrame) -> v1::Filt
 
 pub(crate) fn observation(frame: &GoalFrame) -> v1::PolicyObservation {
     v1::PolicyObservation {
-        state: Some(state(&frame.joint_positions, &frame.orientation)),
+        state: Some(state(&frame.joint_positions, &frame.orientation, None)),
         goal: frame.goal.clone(),
         last_action: frame.last_action.clone(),
     }
 }
 
-pub(crate) fn state(joint_positions: &[f32], orientation: &UnitQuaternion<f64>) -> v1::RobotState {
+pub(crate) fn state(
+    joint_positions: &[f32],
+    orientation: &UnitQuaternion<f64>,
+    measured: Option<Duration>,
+) -> v1::RobotState {
     v1::RobotState {
         joint_positions: joint_positions.to_vec(),
         base_orientation: Some(quaternion(&orientation.cast())),
+        // A time that does not fit a message is none.
+        measurement_time: measured.and_then(|time| time.try_into().ok()),
+        ..v1::RobotState::default()
     }
 }
 
@@ -151,7 +159,7 @@ pub(crate) fn dropped(message: v1::DroppedFrame) -> Dropped {
     }
 }
 
-fn duration(duration: Option<prost_types::Duration>) -> Duration {
+pub(crate) fn duration(duration: Option<prost_types::Duration>) -> Duration {
     duration
         .and_then(|duration| duration.try_into().ok())
         .unwrap_or_default()

@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
-use emp_client::{Client, EmpMode, EvaluateConfig, EvaluationEvent, MassRange, Push};
+use emp_client::{Client, EmpMode, EpisodeEnd, EvaluationConfig, EvaluationEvent, MassRange, Push};
 use emp_robot::Robot;
 use emp_sim::pushes::Kick;
 use serde::Serialize;
@@ -188,9 +188,9 @@ impl Trials {
 
     /// Falls over all motions.
     async fn count(&self, client: &Client, robot: &Robot, mode: EvaluatedMode) -> Result<Count> {
-        let config = EvaluateConfig {
+        let config = EvaluationConfig {
             robot: robot.name().to_owned(),
-            controller: mode.controller().to_owned(),
+            controller: Some(emp_client::controller(mode.controller())?),
             seed: self.seed,
             hand_load: self.load.map(|load| MassRange {
                 least: load,
@@ -202,15 +202,20 @@ impl Trials {
             }),
             amplitude: Some(self.motions.amplitude),
             clip_frames: WHOLE,
-            ..EvaluateConfig::default()
+            ..EvaluationConfig::default()
         };
         let motions = self.motions.sources.clone();
         let mut evaluation = client.evaluate(config, motions).await?;
-        let mut result = None;
+        let (mut result, mut falls) = (None, 0);
         // To the stream's end: only then has the server room for the next evaluation.
         while let Some(event) = evaluation.next().await.context("the evaluation")? {
-            if let EvaluationEvent::Result(last) = event {
-                result = Some(last);
+            match event {
+                EvaluationEvent::Episode(episode) => {
+                    let end = episode.result.map(|result| result.end());
+                    falls += usize::from(end != Some(EpisodeEnd::Completed));
+                }
+                EvaluationEvent::Result(last) => result = Some(last),
+                EvaluationEvent::Preparing(_) | EvaluationEvent::Started(_) => {}
             }
         }
         let result = result.context("the evaluation ended without a result")?;
@@ -218,7 +223,7 @@ impl Trials {
         Ok(Count {
             emp_mode: mode,
             motions: all.episodes as usize,
-            falls: result.failures.len(),
+            falls,
         })
     }
 }

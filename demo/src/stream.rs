@@ -1,7 +1,9 @@
 //! A stream on which each frame is sent when the one before it was answered or given up.
 
 use anyhow::{Context, Result, bail, ensure};
-use emp_client::{Event, FrameSender, StreamEvents};
+use emp_client::{DropCause, DropReason, Event, FrameSender, StreamEvents};
+
+const SUPERSEDED: DropCause = DropCause::Server(DropReason::Superseded);
 
 /// Both ends of a stream to the server.
 pub(crate) struct Stream<F, A> {
@@ -46,6 +48,8 @@ impl<F: Clone, A: Numbered> Stream<F, A> {
                 .context("the stream ended early")?;
             match event {
                 Event::Answer(answer) => return Ok(answer),
+                // A period that was not answered in time is over.
+                Event::Dropped(dropped) if dropped.cause == SUPERSEDED => {}
                 Event::Dropped(dropped) => bail!(
                     "dropped ({}) {} {}",
                     dropped.cause.name(),
@@ -53,6 +57,7 @@ impl<F: Clone, A: Numbered> Stream<F, A> {
                     dropped.description
                 ),
                 Event::ConnectionLost { reason, .. } => eprintln!("connection lost: {reason}"),
+                Event::GoingAway { .. } => eprintln!("the server is being stopped"),
                 Event::Reconnected { .. } => eprintln!("connection restored"),
             }
         }

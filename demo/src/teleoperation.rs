@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use emp_client::{
-    Client, EmpMode, GoalPhase, GuardReport, RampCause, TeleoperatedFrame, TeleoperationAnswer,
-    TeleoperationConfig, TeleoperationFrame,
+    Client, EmpMode, GoalPhase, GuardReport, OperatorInput, RampCause, TeleoperatedFrame,
+    TeleoperationAnswer, TeleoperationConfig, TeleoperationFrame,
 };
 use emp_motion::KeyNodeFrame;
 use emp_robot::Robot;
@@ -60,7 +60,7 @@ impl Answered {
         }
     }
 
-    fn new(frame: TeleoperatedFrame) -> Result<Self> {
+    fn new(frame: TeleoperatedFrame, joints: &[String]) -> Result<Self> {
         let emp_mode = frame.emp_mode();
         let pose = frame.pose.context("an answer without a pose")?;
         let filter = frame.filter.context("an answer without an assessment")?;
@@ -77,14 +77,17 @@ impl Answered {
             },
             emp_mode,
             margin: Some(filter.center_of_mass_margin),
-            guards: frame.guard.as_ref().map_or_else(Vec::new, in_words),
+            guards: frame
+                .guard
+                .as_ref()
+                .map_or_else(Vec::new, |guard| in_words(guard, joints)),
             times: times.map(|(retargeter, policy)| [retargeter, policy]),
         })
     }
 }
 
 /// What the guards did in a control period.
-fn in_words(report: &GuardReport) -> Vec<String> {
+fn in_words(report: &GuardReport, joints: &[String]) -> Vec<String> {
     let phase = match (report.phase(), report.cause()) {
         (GoalPhase::Unspecified | GoalPhase::Following, _) => None,
         (GoalPhase::Ramping, RampCause::OperatorReturned) => Some("ramp to the person's pose"),
@@ -95,13 +98,21 @@ fn in_words(report: &GuardReport) -> Vec<String> {
     };
     let fade = report.emp_progress.map(|_| "blend the EMP in");
     let limited = report.speed_limited_joints.iter();
+    let limited = limited.filter_map(|&joint| joints.get(joint as usize));
     let limited = limited.map(|joint| format!("limit the speed of {joint}"));
     let stages = phase.into_iter().chain(fade).map(str::to_owned);
     stages.chain(limited).collect()
 }
 
 /// A stream in which the robot follows the person.
-pub(crate) struct Teleoperation(Stream<TeleoperationFrame, TeleoperationAnswer>);
+pub(crate) struct Teleoperation {
+    stream: Stream<TeleoperationFrame, TeleoperationAnswer>,
+    /// Names of the goal joints.
+    joints: Vec<String>,
+    /// The simulated robot's clock, and how far it goes on in a control period.
+    time: Duration,
+    period: Duration,
+}
 
 impl Numbered for TeleoperationAnswer {
     fn number(&self) -> u64 {
@@ -112,29 +123,37 @@ impl Numbered for TeleoperationAnswer {
 impl Teleoperation {
     pub(crate) async fn start(client: &Client, robot: &Robot, emp_mode: EmpMode) -> Result<Self> {
         let config = TeleoperationConfig {
-            emp_mode,
+            emp_mode: Some(emp_mode),
+            simulated: true,
             ..TeleoperationConfig::new(robot.name(), "")
         };
         let stream = Stream::new(client.teleoperate(config).await?);
         stream.check_joints(robot.joints().map(|joint| joint.name.as_str()))?;
-        Ok(Self(stream))
+        let goal_joints = robot.goal_joints().iter();
+        Ok(Self {
+            stream,
+            joints: goal_joints.map(|joint| joint.name.clone()).collect(),
+            time: Duration::ZERO,
+            period: Duration::from_secs_f64(1.0 / robot.control_rate_hz()),
+        })
     }
 
     /// A pose and the robot's state become targets.
     pub(crate) async fn ask(&mut self, pose: &KeyNodeFrame, reading: &Reading) -> Result<Answered> {
+        self.time += self.period;
         let frame = TeleoperationFrame {
-            pose: Some(pose.clone()),
+            operator: Some(OperatorInput::pose(pose)),
             joint_positions: reading.joint_positions.clone(),
             orientation: reading.orientation,
+            measured: Some(self.time),
             reset: false,
-            emp_mode: EmpMode::Unspecified,
         };
-        Answered::new(self.0.ask(&frame).await?.result)
+        Answered::new(self.stream.ask(&frame).await?.result, &self.joints)
     }
 
     /// Ends the stream and waits for what is still on its way.
     pub(crate) async fn finish(self) -> Result<()> {
-        self.0.finish().await
+        self.stream.finish().await
     }
 }
 
@@ -148,13 +167,15 @@ mod tests {
             phase: GoalPhase::Following.into(),
             ..GuardReport::default()
         };
-        assert!(in_words(&report).is_empty());
+        let joints = ["waist_yaw".to_owned()];
+        let words = |report: &GuardReport| in_words(report, &joints);
+        assert!(words(&report).is_empty());
         report.phase = GoalPhase::Ramping.into();
         report.cause = RampCause::FirstFrame.into();
         report.emp_progress = Some(0.5);
-        report.speed_limited_joints = vec!["waist_yaw".to_owned()];
+        report.speed_limited_joints = vec![0];
         assert_eq!(
-            in_words(&report),
+            words(&report),
             [
                 "ramp from the measured pose",
                 "blend the EMP in",
@@ -162,6 +183,6 @@ mod tests {
             ]
         );
         report.cause = RampCause::OperatorReturned.into();
-        assert_eq!(in_words(&report)[0], "ramp to the person's pose");
+        assert_eq!(words(&report)[0], "ramp to the person's pose");
     }
 }

@@ -178,6 +178,12 @@ impl HistoryMap {
     /// Refuses a map for stacks of another length.
     pub(crate) fn check(&self, layout: &ObservationLayout) -> Result<(), String> {
         let history = layout.history();
+        let rows = self.0.len();
+        if !(1..=history).contains(&rows) {
+            return Err(format!(
+                "history_map has {rows} rows, expected 1 to {history}"
+            ));
+        }
         match self.0.iter().find(|row| row.len() != history) {
             Some(row) => Err(format!(
                 "a row of history_map has {} numbers, expected {history}",

@@ -3,17 +3,15 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use crate::{MotionError, atomic::AtomicFile};
 use csv::Writer;
-use tempfile::NamedTempFile;
-
-use crate::MotionError;
 
 /// Writes rows to a temporary name beside the target, which appears, whole, with [`finish`](Self::finish).
 #[derive(Debug)]
 pub struct JointCsvWriter {
     path: PathBuf,
     csv: Writer<File>,
-    file: NamedTempFile,
+    file: AtomicFile,
     joints: usize,
 }
 
@@ -24,8 +22,8 @@ impl JointCsvWriter {
     /// [`MotionError::Io`] where the folder cannot be written.
     pub fn create<S: AsRef<str>>(path: &Path, joints: &[S]) -> Result<Self, MotionError> {
         let io = |e| MotionError::io(path, e);
-        let file = crate::atomic::temporary(path).map_err(io)?;
-        let mut csv = Writer::from_writer(file.reopen().map_err(io)?);
+        let file = AtomicFile::create(path).map_err(io)?;
+        let mut csv = Writer::from_writer(file.handle().map_err(io)?);
         let header = std::iter::once("time_s").chain(joints.iter().map(AsRef::as_ref));
         csv.write_record(header).map_err(|e| io(e.into()))?;
         Ok(Self {
@@ -61,8 +59,11 @@ impl JointCsvWriter {
     /// # Errors
     /// [`MotionError::Io`] where the disk refuses.
     pub fn finish(mut self) -> Result<(), MotionError> {
-        let io = |e| MotionError::io(&self.path, e);
-        self.csv.flush().map_err(io)?;
-        crate::atomic::persist(self.file, &self.path).map_err(io)
+        self.csv
+            .flush()
+            .map_err(|e| MotionError::io(&self.path, e))?;
+        self.file
+            .finish()
+            .map_err(|e| MotionError::io(&self.path, e))
     }
 }

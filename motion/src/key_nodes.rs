@@ -58,10 +58,14 @@ pub fn from_bytes(
 /// # Errors
 /// [`MotionError::Io`] where the folder cannot be written.
 pub fn write(path: &Path, clip: &Clip) -> Result<(), MotionError> {
-    let io = |e| MotionError::io(path, e);
-    let mut file = crate::atomic::temporary(path).map_err(io)?;
-    write_to(file.as_file_mut(), clip).map_err(io)?;
-    crate::atomic::persist(file, path).map_err(io)
+    let io = |error| MotionError::io(path, error);
+    let file = crate::atomic::AtomicFile::create(path).map_err(io)?;
+    // An archive is not written from its start to its end: a pipe gets it when it is whole.
+    let mut archive = std::io::Cursor::new(Vec::new());
+    write_to(&mut archive, clip).map_err(io)?;
+    let mut handle = file.handle().map_err(io)?;
+    std::io::Write::write_all(&mut handle, archive.get_ref()).map_err(io)?;
+    file.finish().map_err(io)
 }
 
 fn write_to<W: std::io::Write + std::io::Seek>(file: W, clip: &Clip) -> std::io::Result<W> {

@@ -37,7 +37,12 @@ mod tests {
             .collect();
         assert_eq!(
             services,
-            ["ModelService", "MotionService", "RolloutService"]
+            [
+                "ModelService",
+                "MotionService",
+                "RolloutService",
+                "TeleoperationService"
+            ]
         );
 
         let pose = set

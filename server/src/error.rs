@@ -5,11 +5,14 @@ use std::{collections::HashMap, time::Duration};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
-use crate::{batcher::Rejected, queue::JobError};
+use crate::inference::{
+    batcher::{Rejected, Unanswered},
+    queue::JobError,
+};
 
 /// The domain of every `ErrorInfo`.
 const DOMAIN: &str = "emp.v1";
-/// When to try again while a model is rebuilt or the server is replaced.
+/// When to try again while a model is rebuilt. A server that shuts down does not say: another may be there already.
 const UNAVAILABLE_RETRY: Duration = Duration::from_secs(1);
 
 /// A field of a request that breaks the contract.
@@ -25,8 +28,8 @@ pub(crate) struct FieldError {
 impl FieldError {
     pub(crate) fn new(field: impl Into<String>, description: impl Into<String>) -> Self {
         Self {
-            field: field.into(),
-            description: description.into(),
+            field: shortened(field.into()),
+            description: shortened(description.into()),
         }
     }
 
@@ -50,6 +53,18 @@ impl FieldError {
     pub(crate) fn second_config() -> Self {
         Self::new("config", "only the first message may be a config")
     }
+}
+
+/// Most bytes of what a client sent that are repeated to it: its own headers have a limit.
+const LONGEST_TEXT: usize = 512;
+
+/// A text of a length that fits a header.
+pub(crate) fn shortened(mut text: String) -> String {
+    if text.len() > LONGEST_TEXT {
+        text.truncate(text.floor_char_boundary(LONGEST_TEXT));
+        text.push('…');
+    }
+    text
 }
 
 /// Why a call failed.
@@ -80,8 +95,22 @@ pub(crate) enum ServiceError {
     ModelFailed(String),
     #[error("the model is being rebuilt after a failure")]
     ModelUnavailable,
+    /// A robot's file is damaged: it is not served until that is mended.
+    #[error("robot {robot:?} is not served: {reason}")]
+    NotServing { robot: String, reason: String },
     #[error("the job failed: {0}")]
     JobFailed(String),
+    #[error("the job was cancelled")]
+    JobCancelled,
+    /// The client sent nothing for too long.
+    #[error("{0}")]
+    Silent(&'static str),
+    /// Another stream took the place of this one.
+    #[error("{0}")]
+    Replaced(&'static str),
+    /// Another controller commands the session.
+    #[error("session {session:?} has another controller; its lease ends in {} ms", left.as_millis())]
+    LeaseTaken { session: String, left: Duration },
     /// A session has one robot and one operator at most.
     #[error("session {session:?} has its {seat} already")]
     SeatTaken { session: String, seat: &'static str },
@@ -114,16 +143,37 @@ impl From<Rejected> for ServiceError {
     }
 }
 
+impl From<Unanswered> for ServiceError {
+    fn from(why: Unanswered) -> Self {
+        match why {
+            Unanswered::Late => Self::DeadlineExceeded,
+            Unanswered::Rejected(rejected) => rejected.into(),
+            Unanswered::Failed(error) => error.into(),
+        }
+    }
+}
+
+/// What a call says that was not answered, or whose task is gone.
+pub(crate) fn task_failed() -> Status {
+    let details = ErrorDetails::with_error_info("TASK_FAILED", DOMAIN, HashMap::new());
+    let message = "the server failed in this call; its log says how";
+    Status::with_error_details(Code::Internal, message, details)
+}
+
 impl ServiceError {
     fn code(&self) -> Code {
         match self {
             Self::InvalidField(_) | Self::NotServed { .. } => Code::InvalidArgument,
             Self::NotFound { .. } => Code::NotFound,
-            Self::DeadlineExceeded => Code::DeadlineExceeded,
+            Self::DeadlineExceeded | Self::Silent(_) => Code::DeadlineExceeded,
             Self::SeatTaken { .. } => Code::AlreadyExists,
+            Self::LeaseTaken { .. } => Code::FailedPrecondition,
+            Self::Replaced(_) | Self::JobCancelled => Code::Aborted,
             Self::Overloaded { .. } => Code::ResourceExhausted,
             Self::ModelFailed(_) | Self::JobFailed(_) => Code::Internal,
-            Self::ModelUnavailable | Self::ShuttingDown => Code::Unavailable,
+            Self::ModelUnavailable | Self::ShuttingDown | Self::NotServing { .. } => {
+                Code::Unavailable
+            }
             Self::Transport(status) => status.code(),
         }
     }
@@ -137,7 +187,12 @@ impl ServiceError {
             Self::DeadlineExceeded => "DEADLINE_EXCEEDED",
             Self::Overloaded { .. } => "OVERLOADED",
             Self::ModelFailed(_) => "MODEL_FAILED",
+            Self::NotServing { .. } => "NOT_SERVING",
             Self::JobFailed(_) => "JOB_FAILED",
+            Self::JobCancelled => "JOB_CANCELLED",
+            Self::Silent(_) => "SILENT",
+            Self::Replaced(_) => "REPLACED",
+            Self::LeaseTaken { .. } => "LEASE_TAKEN",
             Self::SeatTaken { .. } => "SEAT_TAKEN",
             Self::ModelUnavailable => "MODEL_UNAVAILABLE",
             Self::ShuttingDown => "SHUTTING_DOWN",
@@ -158,6 +213,10 @@ impl ServiceError {
                     ("served", served.clone()),
                 ]
             }
+            Self::NotServing { robot, reason } => {
+                vec![("robot", robot.clone()), ("reason", reason.clone())]
+            }
+            Self::LeaseTaken { session, .. } => vec![("session", session.clone())],
             Self::SeatTaken { session, seat } => {
                 vec![("session", session.clone()), ("seat", (*seat).to_owned())]
             }
@@ -187,7 +246,7 @@ impl ServiceError {
             Self::Overloaded { retry, .. } => {
                 details.set_retry_info(Some(*retry));
             }
-            Self::ModelUnavailable | Self::ShuttingDown => {
+            Self::ModelUnavailable => {
                 details.set_retry_info(Some(UNAVAILABLE_RETRY));
             }
             _ => {}
@@ -200,7 +259,10 @@ impl From<ServiceError> for Status {
     fn from(error: ServiceError) -> Self {
         match error {
             ServiceError::Transport(status) => status,
-            error => Self::with_error_details(error.code(), error.to_string(), error.details()),
+            error => {
+                let message = shortened(error.to_string());
+                Self::with_error_details(error.code(), message, error.details())
+            }
         }
     }
 }

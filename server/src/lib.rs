@@ -3,33 +3,31 @@
 //!
 //! Evaluations and rollouts are jobs (`rollouts`) on threads of their own, behind every stream.
 //!
-//! Transport (`motion`, `models`, `rollouts`, `session`) knows messages and deadlines; the core (`batcher`, `queue`) knows neither; a model
-//! is known only through [`Backend`]. Statuses are made in `error` and nowhere else. This crate never computes a joint
-//! angle itself, and it runs no model and no foreign code on a tokio thread.
+//! `services` has what each call does. Messages become the server's own values in `decode` and nowhere else, and values messages in
+//! `encode`. Streams with one model live in `session`, a robot's and its person's in `teleoperation`, jobs in `rollouts`. They bring
+//! work to models through `inference`, which knows no message; a model is known only through [`Backend`]. Statuses are made in
+//! `error` and nowhere else. This crate never computes a joint angle itself, and it runs no model and no foreign code on a tokio
+//! thread.
 
 #![forbid(unsafe_code)]
 
-mod backend;
-mod batcher;
 mod catalog;
-mod check;
-mod control;
-mod deadline;
+mod decode;
+mod dropped;
+mod encode;
 mod error;
-mod models;
-mod motion;
-mod pose;
-mod queue;
-mod robot_state;
+mod health;
+mod inference;
 mod rollouts;
 mod serve;
+mod services;
 mod session;
 mod settings;
+mod streams;
 mod teleoperation;
-mod wire;
 
-pub use backend::{Backend, BackendError, BoxedBackend, Build, RetargetBackend};
 pub use catalog::{Catalog, CatalogError};
+pub use inference::backend::{Backend, BackendError, BoxedBackend, Build, RetargetBackend};
 pub use serve::{Drain, ServeError, Server};
 pub use settings::{
     BatchingSettings, DEFAULT_SETTINGS, LogFormat, LogSettings, Overrides, RolloutSettings,

@@ -1,38 +1,32 @@
 //! The server around the services: listening, health, reflection, and the end.
 
-use std::{collections::BTreeSet, net::SocketAddr, sync::Arc, time::Duration};
+use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use emp_proto::{
     FILE_DESCRIPTOR_SET,
     v1::{
         model_service_server::ModelServiceServer, motion_service_server::MotionServiceServer,
         rollout_service_server::RolloutServiceServer,
+        teleoperation_service_server::TeleoperationServiceServer,
     },
 };
 use tokio::{net::TcpListener, time::timeout};
-use tokio_stream::{StreamExt as _, StreamMap, wrappers::WatchStream};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::{Server as Transport, server::TcpIncoming};
-use tonic_health::{ServingStatus, server::HealthReporter};
 
 use crate::{
-    batcher::ModelState, catalog::Catalog, models::Models, motion::Motion, rollouts::Rollouts,
+    catalog::Catalog,
+    health,
+    services::{
+        MAX_JOB_MESSAGE, MAX_MESSAGE, model::Models, motion::Motion, rollout::Rollouts,
+        teleoperation::Teleoperation,
+    },
     settings::Settings,
+    streams::Streams,
 };
-
-/// Names of the services in `grpc.health.v1`; the empty one is the whole server.
-const MOTION: &str = "emp.v1.MotionService";
-const MODELS: &str = "emp.v1.ModelService";
-const ROLLOUTS: &str = "emp.v1.RolloutService";
-const WHOLE: &str = "";
-const HEALTH: [&str; 4] = [WHOLE, MOTION, MODELS, ROLLOUTS];
 
 /// A silent connection is asked after this long, and closed when it does not answer in time.
 const KEEPALIVE: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(5)];
-/// Largest message that is about single frames: one pose takes about 200 bytes, fifteen robot states 4 KiB.
-const MAX_MESSAGE: usize = 256 << 10;
-/// Largest message of jobs: parts of motions, policies.
-const MAX_JOB_MESSAGE: usize = 16 << 20;
 /// Streams that a client may reset before they were accepted. h2's own 20 is too few for a client that cancels many
 /// calls at once; it would lose its connection.
 const MAX_RESETS: usize = 1_000;
@@ -108,12 +102,9 @@ impl Server {
     /// When the transport fails.
     pub async fn run(self, shutdown: CancellationToken) -> Result<Drain, ServeError> {
         let (reporter, health) = tonic_health::server::health_reporter();
-        for service in HEALTH {
-            reporter
-                .set_service_status(service, ServingStatus::Serving)
-                .await;
-        }
-        tokio::spawn(report_models(
+        let reported = health::begin(&self.catalog, &reporter).await;
+        tokio::spawn(health::report(
+            reported,
             Arc::clone(&self.catalog),
             reporter.clone(),
             shutdown.clone(),
@@ -126,13 +117,12 @@ impl Server {
                 // So that grpcurl can print the details of an error.
                 .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET)
         };
-        let motion = Motion::new(Arc::clone(&self.catalog), &self.settings, shutdown.clone());
-        let models = Models::new(Arc::clone(&self.catalog));
-        let rollouts = Rollouts::new(
-            Arc::clone(&self.catalog),
-            &self.settings.rollouts,
-            shutdown.clone(),
-        );
+        let catalog = || Arc::clone(&self.catalog);
+        let streams = Arc::new(Streams::new(catalog(), &self.settings, shutdown.clone()));
+        let motion = Motion::new(catalog(), Arc::clone(&streams));
+        let models = Models::new(catalog(), &self.settings, streams.drain().clone());
+        let teleoperation = Teleoperation::new(catalog(), &self.settings, streams);
+        let rollouts = Rollouts::new(catalog(), &self.settings, shutdown.clone());
         let incoming = TcpIncoming::from(self.listener).with_nodelay(Some(true));
         let serving = Transport::builder()
             .trace_fn(|request| tracing::info_span!("call", path = request.uri().path()))
@@ -143,6 +133,10 @@ impl Server {
             .add_service(reflect().build_v1()?)
             .add_service(reflect().build_v1alpha()?)
             .add_service(MotionServiceServer::new(motion).max_decoding_message_size(MAX_MESSAGE))
+            .add_service(
+                TeleoperationServiceServer::new(teleoperation)
+                    .max_decoding_message_size(MAX_MESSAGE),
+            )
             .add_service(ModelServiceServer::new(models).max_decoding_message_size(MAX_MESSAGE))
             .add_service(
                 RolloutServiceServer::new(rollouts).max_decoding_message_size(MAX_JOB_MESSAGE),
@@ -155,56 +149,10 @@ impl Server {
             () = shutdown.cancelled() => {}
         }
         tracing::info!(grace = ?self.settings.grace(), "draining");
-        close_health(reporter).await;
+        health::close(&self.catalog, reporter).await;
         match timeout(self.settings.grace(), serving).await {
             Ok(ended) => ended.map(|()| Drain::Complete).map_err(Into::into),
             Err(_) => Ok(Drain::CutOff),
         }
-    }
-}
-
-/// Keeps the motion service's health at that of its models, until the server shuts down.
-async fn report_models(
-    catalog: Arc<Catalog>,
-    reporter: HealthReporter,
-    shutdown: CancellationToken,
-) {
-    let mut changes: StreamMap<_, _> = catalog
-        .states()
-        .into_iter()
-        .map(|(name, state)| (name, WatchStream::new(state)))
-        .collect();
-    let mut failed = BTreeSet::new();
-    let mut reported = ServingStatus::Serving;
-    loop {
-        let (model, state) = tokio::select! {
-            biased;
-            () = shutdown.cancelled() => return,
-            Some(change) = changes.next() => change,
-        };
-        match state {
-            ModelState::Serving => failed.remove(&model),
-            ModelState::Rebuilding => failed.insert(model),
-        };
-        let status = if failed.is_empty() {
-            ServingStatus::Serving
-        } else {
-            ServingStatus::NotServing
-        };
-        // Those who watch are told of every report, changed or not.
-        if status != reported {
-            reporter.set_service_status(MOTION, status).await;
-            reported = status;
-        }
-    }
-}
-
-/// Tells those who watch that the server goes, and ends their watches, which would hold it up otherwise.
-async fn close_health(mut reporter: HealthReporter) {
-    for service in HEALTH {
-        reporter
-            .set_service_status(service, ServingStatus::NotServing)
-            .await;
-        reporter.clear_service_status(service).await;
     }
 }

@@ -17,6 +17,8 @@ pub const DEFAULT_SETTINGS: &str = include_str!("default.toml");
 /// Bounds of how long a guard may wait or take, seconds.
 const SHORTEST_WAIT: f64 = 0.05;
 const LONGEST_WAIT: f64 = 60.0;
+/// Longest time that a stream may be silent, seconds.
+const LONGEST_SILENCE: f64 = 86_400.0;
 
 /// Every setting. What each means and its default: [`DEFAULT_SETTINGS`].
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -85,10 +87,16 @@ pub struct BatchingSettings {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StreamSettings {
-    /// Most open streams.
+    /// Most open streams of poses, operators and observers.
     pub max_open: NonZeroUsize,
+    /// Most open streams of robots.
+    pub max_robots: NonZeroUsize,
     /// Most frames of one stream that wait inside the server.
     pub buffer: NonZeroUsize,
+    /// How long a stream's config may take, seconds.
+    pub config_seconds: f64,
+    /// How long a stream may be silent, seconds.
+    pub idle_seconds: f64,
 }
 
 /// The guards around a robot that is teleoperated.
@@ -161,8 +169,10 @@ pub struct RolloutSettings {
     pub max_jobs: NonZeroUsize,
     /// Threads of each job; 0 for one a core.
     pub threads: usize,
-    /// Most frames of motion that a call may send.
+    /// Most frames of motion that a job may have.
     pub max_frames: NonZeroUsize,
+    /// How many evaluations that have ended are kept.
+    pub kept_jobs: NonZeroUsize,
 }
 
 /// The end.
@@ -244,6 +254,18 @@ impl Settings {
 
     fn check(&self) -> Result<(), SettingsError> {
         self.teleoperation.check()?;
+        for (key, found) in [
+            ("streams.config_seconds", self.streams.config_seconds),
+            ("streams.idle_seconds", self.streams.idle_seconds),
+        ] {
+            if !(SHORTEST_WAIT..=LONGEST_SILENCE).contains(&found) {
+                return Err(SettingsError::Range {
+                    key,
+                    found: found.to_string(),
+                    expected: "0.05 to 86400 seconds",
+                });
+            }
+        }
         let grace = self.shutdown.grace_seconds;
         if Duration::try_from_secs_f64(grace).is_err() {
             let (key, expected) = ("shutdown.grace_seconds", "zero or more seconds");

@@ -40,6 +40,24 @@ impl Divergence {
         Self::Control,
     ];
 
+    /// What diverged, in a word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Inertia => "inertia",
+            Self::Contacts => "contacts",
+            Self::Constraints => "constraints",
+            Self::Position => "position",
+            Self::Velocity => "velocity",
+            Self::Acceleration => "acceleration",
+            Self::Control => "control",
+        }
+    }
+
+    /// The divergence with this [`name`](Self::name).
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
+
     /// The first thing that MuJoCo warned of more than `seen` times.
     pub(crate) fn warned(warnings: &[MjWarningStat], seen: i32) -> Option<Self> {
         let mut kinds = warnings.iter().zip(Self::ALL);

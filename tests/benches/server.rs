@@ -12,8 +12,8 @@ use std::{
 use anyhow::Context as _;
 use criterion::Criterion;
 use emp_client::{
-    Client, Delivery, EmpMode, EvaluateConfig, EvaluationEvent, Event, ProceduralClips, Statistics,
-    StreamConfig, Summary,
+    Client, Delivery, EmpMode, EvaluationConfig, EvaluationEvent, Event, ProceduralClips,
+    Statistics, StreamConfig, Summary,
 };
 use emp_tests::{
     TestServer,
@@ -174,11 +174,11 @@ async fn hold(client: &Client, streams: usize, refine: bool) -> anyhow::Result<S
 /// Teleoperates a robot alone, then while an evaluation takes all the time that the system has left.
 async fn beside_an_evaluation(client: &Client) -> anyhow::Result<()> {
     report("alone", &teleoperate(client, EmpMode::Off).await?);
-    let config = EvaluateConfig {
+    let config = EvaluationConfig {
         robot: ROBOT.to_owned(),
         episodes: 100_000,
         procedural: Some(ProceduralClips { count: 8, seed: 1 }),
-        ..EvaluateConfig::default()
+        ..EvaluationConfig::default()
     };
     let mut evaluation = client.evaluate(config, Vec::new()).await?;
     while !matches!(

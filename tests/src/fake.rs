@@ -191,6 +191,21 @@ pub fn server(settings: Settings, gate: &Gate) -> anyhow::Result<TestServer> {
 /// # Errors
 /// When the model's thread cannot be started.
 pub fn catalog(settings: &Settings, robot: &Arc<Robot>, gate: &Gate) -> anyhow::Result<Catalog> {
+    let mut catalog = Catalog::default();
+    add(&mut catalog, settings, robot, gate)?;
+    Ok(catalog)
+}
+
+/// Adds the fake model behind `gate`, for `robot`.
+///
+/// # Errors
+/// When the model's thread cannot be started.
+pub fn add(
+    catalog: &mut Catalog,
+    settings: &Settings,
+    robot: &Arc<Robot>,
+    gate: &Gate,
+) -> anyhow::Result<()> {
     let joints = robot.goal_joints();
     let card = v1::Model {
         name: "fake".to_owned(),
@@ -209,7 +224,6 @@ pub fn catalog(settings: &Settings, robot: &Arc<Robot>, gate: &Gate) -> anyhow::
             joints,
         }) as RetargetBackend)
     };
-    let mut catalog = Catalog::default();
     catalog.add_retargeter(card, robot, &settings.batching, Box::new(build))?;
-    Ok(catalog)
+    Ok(())
 }

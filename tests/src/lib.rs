@@ -7,6 +7,7 @@
 
 pub mod emp;
 pub mod fake;
+pub mod fuzz;
 pub mod load;
 pub mod policy;
 pub mod process;

@@ -38,8 +38,7 @@ pub fn pose(frame: &KeyNodeFrame) -> HumanPose {
         right_elbow: position(KeyNode::RightElbow),
         left_wrist: position(KeyNode::LeftWrist),
         right_wrist: position(KeyNode::RightWrist),
-        left_wrist_orientation: None,
-        right_wrist_orientation: None,
+        ..HumanPose::default()
     }
 }
 
@@ -54,6 +53,7 @@ pub fn state(joint_positions: &[f32], orientation: &UnitQuaternion<f64>) -> Robo
             y: q.j,
             z: q.k,
         }),
+        ..RobotState::default()
     }
 }
 
@@ -115,6 +115,8 @@ one_of! {
     StreamPolicyResponse: stream_policy_response,
     TeleoperateRequest: teleoperate_request,
     TeleoperateResponse: teleoperate_response,
+    CollectRolloutsRequest: collect_rollouts_request,
+    CollectRolloutsResponse: collect_rollouts_response,
 }
 
 /// An open stream of requests `Q` and responses `R`.

@@ -132,6 +132,10 @@ async fn draining_answers_what_waits_and_ends_streams_as_unavailable() -> anyhow
             .await?
             .map_or(true, |status| status.is_none())
     );
+    assert!(matches!(
+        next(&mut events).await?,
+        Some(Event::GoingAway { .. })
+    ));
     gate.let_batches_pass();
     assert!(
         matches!(next(&mut events).await?, Some(Event::Answer(answer)) if answer.joint_angles[0] == 0.3)
@@ -265,7 +269,7 @@ async fn a_stream_survives_a_killed_server_and_latest_drops_what_is_stale() -> a
                 assert_eq!(*resent, 0);
                 after_reconnect = Some(0);
             }
-            Event::ConnectionLost { .. } => {}
+            Event::ConnectionLost { .. } | Event::GoingAway { .. } => {}
         }
     }
     numbers.sort_unstable();

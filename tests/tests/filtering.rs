@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use emp_client::{
-    ChangeReason, Client, Delivery, DropReason, EmpMode, EvaluateConfig, EvaluationEvent, Event,
+    ChangeReason, Client, Delivery, DropReason, EmpMode, EvaluationConfig, EvaluationEvent, Event,
     FilterAnswer, FilterConfig, FilterResult, GoalFrame, GoalHistory, PolicyConfig,
     ProceduralClips, RobotFrame,
 };
@@ -16,7 +16,7 @@ use emp_models::{
     observation::RobotState,
 };
 use emp_proto::v1::{
-    self, FilterFrame, FilterGoalRequest, PolicyObservation, StepPolicyRequest,
+    self, FilterGoalFrame, FilterGoalRequest, PolicyObservation, StepPolicyRequest,
     StreamFilterGoalConfig, StreamFilterGoalRequest, StreamFilterGoalResponse,
     motion_service_client::MotionServiceClient, stream_filter_goal_request::Message as Request,
     stream_filter_goal_response::Message as Response,
@@ -312,13 +312,14 @@ async fn answers_say_how_the_robot_stands_and_why_a_goal_was_changed() -> anyhow
             };
             let expected = assess(&fixture.robot, &state, &goal)?;
             let nearest = expected.nearest_links.expect("links that may touch");
-            let names = nearest
-                .links
-                .map(|link| &fixture.robot.link_spheres()[link].name);
+            let links = nearest.links.map(|link| link as u32);
             assert_eq!(result.change, expected.change);
-            assert!(result.nearest_links.iter().eq(names));
+            assert_eq!(result.nearest_links, links);
             assert_near(
-                &[result.center_of_mass_margin, result.smallest_link_distance],
+                &[
+                    result.center_of_mass_margin,
+                    result.smallest_link_distance.expect("a distance"),
+                ],
                 &[expected.center_of_mass_margin, nearest.distance],
             );
         }
@@ -400,7 +401,7 @@ async fn policies_of_every_mode_share_a_model() -> anyhow::Result<()> {
     Ok(())
 }
 
-fn observation(frame: &FilterFrame) -> PolicyObservation {
+fn observation(frame: &FilterGoalFrame) -> PolicyObservation {
     PolicyObservation {
         state: frame.state.clone(),
         goal: frame.goal.clone(),
@@ -408,8 +409,8 @@ fn observation(frame: &FilterFrame) -> PolicyObservation {
     }
 }
 
-fn wire_frame(number: u64, frame: &GoalFrame) -> FilterFrame {
-    FilterFrame {
+fn wire_frame(number: u64, frame: &GoalFrame) -> FilterGoalFrame {
+    FilterGoalFrame {
         header: Some(raw::header(number)),
         state: Some(raw::state(&frame.joint_positions, &frame.orientation)),
         goal: frame.goal.clone(),
@@ -487,12 +488,12 @@ async fn evaluations_take_the_emp_by_name() -> anyhow::Result<()> {
     let fixture = fixture()?;
     let without = policy::weights()?;
     let server_without = TestServer::start_with(without.path(), |_| {})?;
-    let config = |controller: &str| EvaluateConfig {
+    let config = |controller: &str| EvaluationConfig {
         robot: "emp27".to_owned(),
-        controller: controller.to_owned(),
+        controller: Some(emp_client::controller(controller).expect(controller)),
         episodes: 2,
         procedural: Some(ProceduralClips { count: 1, seed: 1 }),
-        ..EvaluateConfig::default()
+        ..EvaluationConfig::default()
     };
     let client = fixture.client().await?;
     for (specification, name) in [
@@ -515,10 +516,8 @@ async fn evaluations_take_the_emp_by_name() -> anyhow::Result<()> {
         );
 
         let client = Client::connect(&server_without.url()).await?;
-        let mut evaluation = client.evaluate(config(specification), Vec::new()).await?;
-        let error = within("a refusal", evaluation.next())
-            .await?
-            .expect_err("no EMP");
+        let error = client.evaluate(config(specification), Vec::new()).await;
+        let error = error.expect_err("no EMP");
         assert_eq!(error.code(), Some(Code::InvalidArgument));
         assert!(error.to_string().contains("emp27 has no EMP"), "{error}");
     }
@@ -526,13 +525,65 @@ async fn evaluations_take_the_emp_by_name() -> anyhow::Result<()> {
 }
 
 #[tokio::test]
-async fn a_damaged_emp_is_not_served_and_the_rest_is() -> anyhow::Result<()> {
-    let weights = policy::weights()?;
-    std::fs::write(emp::file(&weights), b"not a checkpoint")?;
-    let server = TestServer::start_with(weights.path(), |_| {})?;
-    let models = Client::connect(&server.url()).await?.models().await?;
-    let names: Vec<_> = models.into_iter().map(|model| model.name).collect();
-    assert_eq!(names, ["emp27-policy", "emp27-retargeter"]);
+async fn a_robot_with_a_damaged_emp_is_not_served_and_says_why() -> anyhow::Result<()> {
+    let fixture = fixture()?;
+    let client = fixture.client().await?;
+    let before = client.model("emp27-emp").await?;
+    let (mut sender, mut events) = client.filter_stream(with_mode(EmpMode::On)).await?;
+    let frames = episode(&fixture.robot);
+
+    // While it serves, a damaged file changes nothing.
+    let file = emp::file(&fixture.weights);
+    let good = std::fs::read(&file)?;
+    std::fs::write(&file, b"not a checkpoint")?;
+    let reloaded = client.reload("").await?;
+    assert!(
+        reloaded
+            .iter()
+            .all(|model| model.error.contains("emp27-emp"))
+    );
+    assert_eq!(client.model("emp27-emp").await?, before);
+
+    // A server that starts with it does not serve the robot, least of all without its EMP.
+    match TestServer::start_with(fixture.weights.path(), |_| {}) {
+        // It was the only robot.
+        Err(error) => assert!(error.to_string().contains("no robot of"), "{error}"),
+        Ok(server) => {
+            let client = Client::connect(&server.url()).await?;
+            let robots = client.robots().await?;
+            let emp27 = robots.iter().find(|robot| robot.name == "emp27");
+            let emp27 = emp27.expect("it is known");
+            assert!(!emp27.serving && emp27.reason.contains("emp27-emp"));
+            let refused = client.policy_stream(PolicyConfig::for_robot("emp27")).await;
+            let error = refused.err().expect("not served");
+            assert_eq!(error.reason().as_deref(), Some("NOT_SERVING"), "{error}");
+        }
+    }
+
+    // Another EMP becomes the next version; the stream that is open keeps its own.
+    let shape = emp::small(&fixture.robot, 0.5);
+    emp::write(&file, &fixture.robot, &shape, 77)?;
+    let reloaded = client.reload("emp27").await?;
+    assert!(
+        reloaded.iter().all(|model| model.error.is_empty()),
+        "{reloaded:?}"
+    );
+    let after = client.model("emp27-emp").await?;
+    assert_ne!(after.version, before.version);
+    let expected = fixture.filtered(EmpMode::On, &frames[..1])?;
+    sender.send(&frames[0], None).await?;
+    let Some(Event::Answer(answer)) = within("an answer", events.next()).await?? else {
+        panic!("unanswered")
+    };
+    assert_equal(&answer.result, &expected[0]);
+    let pinned = |version: &str| FilterConfig {
+        model_version: version.to_owned(),
+        ..with_mode(EmpMode::On)
+    };
+    answers(&client, pinned(&before.version), &frames[..1]).await?;
+    drop((sender, events));
+    answers(&client, pinned(&after.version), &frames[..1]).await?;
+    std::fs::write(&file, good)?;
     Ok(())
 }
 
@@ -557,8 +608,8 @@ async fn emps_are_listed_with_their_versions() -> anyhow::Result<()> {
 }
 
 /// Frames with one thing wrong each, and the field that is.
-fn bad_frames(good: &GoalFrame) -> Vec<(&'static str, FilterFrame)> {
-    let with = |change: &dyn Fn(&mut FilterFrame)| {
+fn bad_frames(good: &GoalFrame) -> Vec<(&'static str, FilterGoalFrame)> {
+    let with = |change: &dyn Fn(&mut FilterGoalFrame)| {
         let mut frame = wire_frame(0, good);
         change(&mut frame);
         frame
@@ -655,7 +706,7 @@ async fn bad_frames_are_dropped_by_field_and_leave_no_trace() -> anyhow::Result<
             assert_equal(&result(&mut stream).await?, &reference.step(frame)?);
         }
         // The `reset` of a bad frame holds for the frame after it.
-        let bad = FilterFrame {
+        let bad = FilterGoalFrame {
             goal: Vec::new(),
             reset: true,
             ..wire_frame(0, &frames[0])

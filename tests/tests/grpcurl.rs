@@ -58,6 +58,7 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
         "emp.v1.ModelService",
         "emp.v1.MotionService",
         "emp.v1.RolloutService",
+        "emp.v1.TeleoperationService",
         "grpc.health.v1.Health",
     ] {
         assert!(services.contains(service), "{services}");
@@ -78,7 +79,7 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
             "emp.v1.FilterResult",
             "is inside the support polygon; metres, negative outside",
         ),
-        ("emp.v1.EvaluateConfig", "no unit, 0.1 to 10. Left out: 1"),
+        ("emp.v1.EvaluationConfig", "no unit, 0.1 to 10. Left out: 1"),
         (
             "emp.v1.RolloutBlock",
             "The policy's mean actions, `CollectStarted.actions` numbers a row",
@@ -88,7 +89,13 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
         assert!(description.contains(comment), "{description}");
     }
 
-    for service in ["emp.v1.MotionService", "emp.v1.RolloutService"] {
+    for service in [
+        "emp.v1.MotionService",
+        "emp.v1.TeleoperationService",
+        "emp.v1.RolloutService",
+        "emp.v1.MotionService/emp27-policy",
+        "emp.v1.MotionService/emp27",
+    ] {
         let request = json!({"service": service}).to_string();
         let call = ["grpc.health.v1.Health/Check"];
         let health = stdout(&grpcurl(&server, Some(&request), &call)?)?;
@@ -134,7 +141,7 @@ fn grpcurl_lists_describes_and_calls() -> anyhow::Result<()> {
     assert_eq!(answer["timing"]["batchSize"], 1);
 
     let messages = [
-        json!({"config": {"robot": "emp27", "smoothing": true}}),
+        json!({"config": {"robot": "emp27", "delivery": "DELIVERY_ALL", "smoothing": true}}),
         json!({"frame": {"header": {"sequence_number": 1}, "pose": pose()}}),
         json!({"frame": {"header": {"sequence_number": 2}, "pose": {"waist": {}}}}),
     ]
@@ -196,7 +203,8 @@ fn grpcurl_steps_a_policy_and_evaluates() -> anyhow::Result<()> {
     assert_eq!(length("executableGoal"), Some(15));
 
     let frame = json!({"frame": {"state": state, "goal": goal}});
-    let requests = [json!({"config": {"robot": "emp27"}}), frame.clone(), frame]
+    let config = json!({"config": {"robot": "emp27", "delivery": "DELIVERY_ALL"}});
+    let requests = [config, frame.clone(), frame]
         .map(|message| message.to_string())
         .join("\n");
     let call = ["emp.v1.MotionService/StreamPolicy"];
@@ -210,12 +218,10 @@ fn grpcurl_steps_a_policy_and_evaluates() -> anyhow::Result<()> {
 
     // No motion file is needed.
     let request = json!({"config": {"robot": "emp27", "episodes": 3, "procedural": {"count": 1}}});
-    let call = ["emp.v1.RolloutService/Evaluate"];
-    let answers = messages(&stdout(&grpcurl(
-        &server,
-        Some(&request.to_string()),
-        &call,
-    )?)?)?;
+    let call = ["emp.v1.RolloutService/StartEvaluation"];
+    let job = stdout(&grpcurl(&server, Some(&request.to_string()), &call)?)?;
+    let call = ["emp.v1.RolloutService/WatchEvaluation"];
+    let answers = messages(&stdout(&grpcurl(&server, Some(&job), &call)?)?)?;
     let episodes = answers
         .iter()
         .filter(|answer| answer["episode"].is_object());
@@ -248,7 +254,9 @@ fn grpcurl_filters_goals() -> anyhow::Result<()> {
     assert!(result["regloss"].is_f64() && result["centerOfMassMargin"].is_f64());
     assert_eq!(result["applied"], 1.0);
 
-    let config = json!({"config": {"robot": "emp27", "emp_mode": "EMP_MODE_ON"}});
+    let config = json!({"config": {
+        "robot": "emp27", "delivery": "DELIVERY_ALL", "emp_mode": "EMP_MODE_ON",
+    }});
     let frame = json!({"frame": {"state": state, "goal": goal}});
     let requests = [config, frame.clone(), frame]
         .map(|message| message.to_string())

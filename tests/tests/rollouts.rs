@@ -4,14 +4,15 @@ use std::{sync::Arc, time::Duration};
 
 use emp_client::{
     Client, ClientError, CollectFinished, CollectRequest, CollectRolloutsConfig, Collection,
-    EvaluateConfig, Evaluation, EvaluationEvent, EvaluationMetrics, EvaluationResult,
-    GoalClip as SentClip, MassRange, Metric, ProceduralClips, Push, RolloutBlock, StepEnd,
+    EnvironmentRandomization, EnvironmentSettings, EpisodeEnd, EpisodeResult, Evaluation,
+    EvaluationConfig, EvaluationEvent, EvaluationMetrics, EvaluationResult, GoalClip as SentClip,
+    JobState, MassRange, Metric, ProceduralClips, Push, Range, RewardWeight, RolloutBlock, StepEnd,
 };
-use emp_models::{controller::Controller, policy::Policy, retarget::Retargeter};
+use emp_models::{controller::Controller, retarget::Retargeter};
 use emp_motion::{Clip, skills};
 use emp_proto::v1::{
-    EvaluateRequest, MotionClip, MotionPoses, evaluate_request::Message,
-    rollout_service_client::RolloutServiceClient,
+    MotionClip, MotionPoses, StartEvaluationRequest, WatchEvaluationRequest,
+    rollout_service_client::RolloutServiceClient, start_evaluation_request::Message,
 };
 use emp_server::Drain;
 use emp_sim::{
@@ -36,20 +37,24 @@ const ROUNDING: f64 = 1e-3;
 /// Episodes that no test waits for.
 const ENDLESS: u32 = 100_000;
 
-fn config() -> EvaluateConfig {
-    EvaluateConfig {
+fn config() -> EvaluationConfig {
+    EvaluationConfig {
         robot: "emp27".to_owned(),
         seed: 7,
-        ..EvaluateConfig::default()
+        ..EvaluationConfig::default()
     }
+}
+
+fn controller(text: &str) -> Option<emp_client::Controller> {
+    Some(emp_client::controller(text).expect("a controller"))
 }
 
 fn procedural(count: u32) -> Option<ProceduralClips> {
     Some(ProceduralClips { count, seed: 3 })
 }
 
-fn endless() -> EvaluateConfig {
-    EvaluateConfig {
+fn endless() -> EvaluationConfig {
+    EvaluationConfig {
         procedural: procedural(1),
         episodes: ENDLESS,
         ..config()
@@ -72,25 +77,42 @@ async fn next(evaluation: &mut Evaluation) -> anyhow::Result<Option<EvaluationEv
 }
 
 /// Follows an evaluation to its result; the clips of its episodes come first.
-async fn finish(mut evaluation: Evaluation) -> anyhow::Result<(Vec<String>, EvaluationResult)> {
-    let (mut clips, mut result) = (Vec::new(), None);
+async fn finish(mut evaluation: Evaluation) -> anyhow::Result<Finished> {
+    let (mut clips, mut failures, mut result) = (Vec::new(), Vec::new(), None);
     while let Some(event) = next(&mut evaluation).await? {
         match event {
             EvaluationEvent::Preparing(preparing) => assert!(preparing.done <= preparing.motions),
             EvaluationEvent::Started(started) => {
                 assert_eq!(started.robot, "emp27");
-                assert_eq!(started.model, "emp27-policy");
+                assert_eq!(started.policy, "emp27-policy");
                 assert_eq!(started.retargeter, "emp27-retargeter");
             }
             EvaluationEvent::Episode(episode) => {
                 let result = episode.result.expect("a result");
-                clips.push(result.clip);
+                clips.push(result.clip.clone());
+                if result.end() != EpisodeEnd::Completed {
+                    failures.push(result);
+                }
                 assert_eq!(episode.finished as usize, clips.len());
             }
             EvaluationEvent::Result(last) => result = Some(last),
         }
     }
-    Ok((clips, result.expect("a result")))
+    failures.sort_by_key(|episode| episode.episode);
+    Ok(Finished {
+        clips,
+        failures,
+        result: result.expect("a result"),
+    })
+}
+
+/// What came of an evaluation.
+#[derive(Debug, PartialEq)]
+struct Finished {
+    clips: Vec<String>,
+    /// By number.
+    failures: Vec<EpisodeResult>,
+    result: EvaluationResult,
 }
 
 /// Waits until an evaluation's episodes begin.
@@ -105,7 +127,12 @@ async fn begun(evaluation: &mut Evaluation) -> anyhow::Result<()> {
 }
 
 /// How an evaluation that cannot go on ends.
-async fn refusal(mut evaluation: Evaluation) -> anyhow::Result<Status> {
+async fn refusal(evaluation: Result<Evaluation, ClientError>) -> anyhow::Result<Status> {
+    let mut evaluation = match evaluation {
+        Ok(evaluation) => evaluation,
+        Err(ClientError::Status(status)) => return Ok(status),
+        Err(error) => panic!("{error}"),
+    };
     loop {
         match within("the end", evaluation.next()).await? {
             Ok(Some(_)) => {}
@@ -157,8 +184,8 @@ fn assert_metrics(served: &EvaluationMetrics, here: &evaluation::Scores, toleran
 #[tokio::test]
 async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> anyhow::Result<()> {
     let weights = policy::weights()?;
-    let config = EvaluateConfig {
-        controller: "velocity-limit:limit=3".to_owned(),
+    let config = EvaluationConfig {
+        controller: controller("velocity-limit:limit=3"),
         procedural: procedural(2),
         amplitude: Some(1.2),
         push: Some(Push {
@@ -177,7 +204,11 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
         results.push(finish(evaluation).await?);
     }
     assert_eq!(results[0], results[1]);
-    let (clips, served) = results.remove(0);
+    let Finished {
+        clips,
+        failures,
+        result: served,
+    } = results.remove(0);
 
     let robot = emp27()?;
     let retargeter = Retargeter::load(
@@ -220,11 +251,11 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
     assert_metrics(&served.recorded.expect("recorded"), recorded_here, ROUNDING);
     assert_metrics(&served.all.expect("all"), &here.all, ROUNDING);
     assert!(!here.failures.is_empty(), "a random policy falls");
-    assert_eq!(served.failures.len(), here.failures.len());
-    for (served, here) in served.failures.iter().zip(&here.failures) {
+    assert_eq!(failures.len(), here.failures.len());
+    for (served, here) in failures.iter().zip(&here.failures) {
         assert_eq!(
             (&served.clip, served.failure_time, &served.reason),
-            (&here.clip, here.time, &here.reason)
+            (&here.clip, Some(here.time), &here.reason)
         );
     }
     Ok(())
@@ -234,11 +265,11 @@ async fn an_evaluation_gives_the_same_bits_twice_and_those_of_this_process() -> 
 async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let server = TestServer::start_with(weights.path(), |settings| {
-        settings.rollouts.max_frames = 500.try_into().expect("not zero");
+        settings.rollouts.max_frames = 1_500.try_into().expect("not zero");
     })?;
     let client = Client::connect(&server.url()).await?;
-    let with = |change: &dyn Fn(&mut EvaluateConfig)| {
-        let mut config = EvaluateConfig {
+    let with = |change: &dyn Fn(&mut EvaluationConfig)| {
+        let mut config = EvaluationConfig {
             procedural: procedural(1),
             ..config()
         };
@@ -247,18 +278,27 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
     };
     let cases = [
         ("robot", with(&|config| config.robot = "nobody".to_owned())),
-        ("model", with(&|config| config.model = "other".to_owned())),
+        ("model", with(&|config| config.policy = "other".to_owned())),
         (
             "model_version",
-            with(&|config| config.model_version = "0".to_owned()),
+            with(&|config| config.policy_version = "0".to_owned()),
+        ),
+        (
+            "model",
+            with(&|config| config.retargeter = "other".to_owned()),
+        ),
+        ("robot", with(&|config| config.emp = "other".to_owned())),
+        (
+            "config.procedural.count",
+            with(&|config| config.procedural = procedural(2)),
         ),
         (
             "config.controller",
-            with(&|config| config.controller = "wishful-thinking".to_owned()),
+            with(&|config| config.controller = controller("wishful-thinking")),
         ),
         (
             "config.controller",
-            with(&|config| config.controller = "velocity-limit:limit=-1".to_owned()),
+            with(&|config| config.controller = controller("velocity-limit:limit=-1")),
         ),
         (
             "config.procedural",
@@ -323,7 +363,7 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
         ),
     ];
     for (field, config) in cases {
-        let status = refusal(client.evaluate(config, Vec::new()).await?).await?;
+        let status = refusal(client.evaluate(config, Vec::new()).await).await?;
         assert_eq!(wrong_field(&status), field, "{}", status.message());
     }
 
@@ -333,6 +373,13 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
             name: "motion".to_owned(),
             fps: 50.0,
             poses,
+        })
+    };
+    let at_rate = |fps, frames| {
+        Message::Clip(MotionClip {
+            name: "motion".to_owned(),
+            fps,
+            poses: vec![good(); frames],
         })
     };
     let bad = || {
@@ -371,7 +418,7 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
         ),
         (
             "clip.poses",
-            vec![Message::Config(config()), clip(vec![good(); 501])],
+            vec![Message::Config(config()), clip(vec![good(); 1_501])],
         ),
         (
             "clip.poses",
@@ -388,30 +435,43 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
             ],
         ),
         (
-            "clip.fps",
+            "clip.name",
             vec![
                 Message::Config(config()),
                 Message::Clip(MotionClip {
-                    name: "motion".to_owned(),
-                    ..MotionClip::default()
+                    name: "x".repeat(129),
+                    fps: 50.0,
+                    poses: vec![good()],
                 }),
             ],
+        ),
+        // What two poses become counts, not that they are two.
+        (
+            "clip.poses",
+            vec![Message::Config(config()), at_rate(1.0, 40)],
+        ),
+        ("clip.fps", vec![Message::Config(config()), at_rate(0.0, 2)]),
+        (
+            "clip.fps",
+            vec![Message::Config(config()), at_rate(1e-9, 2)],
+        ),
+        (
+            "clip.fps",
+            vec![Message::Config(config()), at_rate(f64::MIN_POSITIVE, 2)],
+        ),
+        (
+            "clip.fps",
+            vec![Message::Config(config()), at_rate(f64::NAN, 2)],
         ),
     ];
     let mut raw = RolloutServiceClient::connect(server.url()).await?;
     for (field, messages) in cases {
-        let requests = messages.into_iter().map(|message| EvaluateRequest {
+        let requests = messages.into_iter().map(|message| StartEvaluationRequest {
             message: Some(message),
         });
         let requests = tokio_stream::iter(requests.collect::<Vec<_>>());
-        let mut responses = raw.evaluate(requests).await?.into_inner();
-        let status = loop {
-            match within("the end", responses.message()).await? {
-                Ok(Some(_)) => {}
-                Ok(None) => panic!("{field}: it ended well"),
-                Err(status) => break status,
-            }
-        };
+        let answer = within("an answer", raw.start_evaluation(requests)).await?;
+        let status = answer.expect_err(field);
         assert_eq!(wrong_field(&status), field, "{}", status.message());
     }
     Ok(())
@@ -421,9 +481,8 @@ async fn wrong_evaluations_are_refused_by_field() -> anyhow::Result<()> {
 async fn place_again(client: &Client) -> anyhow::Result<Evaluation> {
     within("a place", async {
         loop {
-            let mut evaluation = client.evaluate(endless(), Vec::new()).await?;
-            match evaluation.next().await {
-                Ok(_) => return Ok(evaluation),
+            match client.evaluate(endless(), Vec::new()).await {
+                Ok(evaluation) => return Ok(evaluation),
                 Err(error) => {
                     assert_eq!(error.code(), Some(Code::ResourceExhausted), "{error}");
                     tokio::time::sleep(Duration::from_millis(5)).await;
@@ -442,7 +501,7 @@ async fn a_job_beyond_the_limit_is_refused_and_a_cancelled_one_makes_room() -> a
     let mut running = client.evaluate(endless(), Vec::new()).await?;
     begun(&mut running).await?;
 
-    let status = refusal(client.evaluate(endless(), Vec::new()).await?).await?;
+    let status = refusal(client.evaluate(endless(), Vec::new()).await).await?;
     assert_eq!(status.code(), Code::ResourceExhausted, "{status:?}");
     let details = status.get_error_details();
     assert_eq!(
@@ -462,36 +521,110 @@ async fn a_job_beyond_the_limit_is_refused_and_a_cancelled_one_makes_room() -> a
     let error = learner.expect_err("no place");
     assert_eq!(error.code(), Some(Code::ResourceExhausted));
 
+    // Nobody watches it, and it goes on.
+    let job = running.job().to_owned();
     drop(running);
+    let jobs = client.jobs().await?;
+    assert_eq!(jobs.len(), 1);
+    assert_eq!((&jobs[0].id, jobs[0].state()), (&job, JobState::Running));
+    client.cancel_job(&job).await?;
     place_again(&client).await?;
+    let status = refusal(client.watch(&job, 0).await).await?;
+    assert_eq!(status.code(), Code::Aborted, "{status:?}");
+    client.cancel_job(&job).await?;
+    let status = refusal(client.watch(&job, 0).await).await?;
+    assert_eq!(status.code(), Code::NotFound, "{status:?}");
     Ok(())
 }
 
 #[tokio::test]
-async fn a_jobs_deadline_ends_it_and_frees_its_place() -> anyhow::Result<()> {
+async fn a_place_is_not_held_by_a_call_that_has_not_sent_all() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let server = TestServer::start_with(weights.path(), |_| {})?;
+    let mut raw = RolloutServiceClient::connect(server.url()).await?;
     let (requests, outbound) = tokio::sync::mpsc::channel(4);
     let message = Some(Message::Config(endless()));
-    requests.send(EvaluateRequest { message }).await?;
-    drop(requests);
-    let mut call = Request::new(ReceiverStream::new(outbound));
+    requests.send(StartEvaluationRequest { message }).await?;
+    let silent =
+        tokio::spawn(async move { raw.start_evaluation(ReceiverStream::new(outbound)).await });
+    let client = Client::connect(&server.url()).await?;
+    let config = EvaluationConfig {
+        procedural: procedural(1),
+        episodes: 1,
+        ..config()
+    };
+    finish(client.evaluate(config, Vec::new()).await?).await?;
+    assert!(!silent.is_finished());
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_watcher_that_was_cut_off_goes_on_where_it_was() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let client = Client::connect(&server.url()).await?;
+    let config = EvaluationConfig {
+        procedural: procedural(2),
+        episodes: 6,
+        ..config()
+    };
+    let mut first = client.evaluate(config, Vec::new()).await?;
+    begun(&mut first).await?;
+    let (job, next_event) = (first.job().to_owned(), first.next_event());
+    drop(first);
+    let rest = finish(client.watch(&job, next_event).await?).await?;
+    assert_eq!(rest.clips.len(), 6);
+    // After the end, too, and from the start.
+    assert_eq!(finish(client.watch(&job, 0).await?).await?, rest);
+    let jobs = client.jobs().await?;
+    assert_eq!((jobs[0].state(), jobs[0].finished), (JobState::Done, 6));
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_watchers_deadline_ends_its_watch_and_not_the_job() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let client = Client::connect(&server.url()).await?;
+    let mut running = client.evaluate(endless(), Vec::new()).await?;
+    begun(&mut running).await?;
+    let mut call = Request::new(WatchEvaluationRequest {
+        job: running.job().to_owned(),
+        first_event: 0,
+    });
     call.metadata_mut()
-        .insert("grpc-timeout", MetadataValue::from_static("2S"));
+        .insert("grpc-timeout", MetadataValue::from_static("1S"));
     let mut raw = RolloutServiceClient::connect(server.url()).await?;
-    let mut responses = raw.evaluate(call).await?.into_inner();
-    let mut episodes = 0;
+    let mut responses = raw.watch_evaluation(call).await?.into_inner();
     let status = loop {
         match within("the deadline", responses.message()).await? {
-            Ok(Some(_)) => episodes += 1,
+            Ok(Some(_)) => {}
             Ok(None) => panic!("it ended well"),
             Err(status) => break status,
         }
     };
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
     assert!(status.get_error_details().error_info().is_some());
-    assert!(episodes > 0, "what finished was sent");
-    place_again(&Client::connect(&server.url()).await?).await?;
+    assert!(matches!(
+        next(&mut running).await?,
+        Some(EvaluationEvent::Episode(_))
+    ));
+    Ok(())
+}
+
+#[tokio::test]
+async fn controllers_are_listed() -> anyhow::Result<()> {
+    let weights = policy::weights()?;
+    let server = TestServer::start_with(weights.path(), |_| {})?;
+    let client = Client::connect(&server.url()).await?;
+    let names = |controllers: Vec<emp_client::ControllerDescription>| -> Vec<String> {
+        controllers.into_iter().map(|one| one.name).collect()
+    };
+    let all = names(client.controllers("").await?);
+    assert!(all.contains(&"emp".to_owned()) && all.contains(&"one-euro".to_owned()));
+    let without_emp = names(client.controllers("emp27").await?);
+    assert!(!without_emp.contains(&"emp".to_owned()));
+    assert_eq!(without_emp[0], "decoupled");
     Ok(())
 }
 
@@ -508,7 +641,7 @@ async fn draining_ends_jobs_as_unavailable() -> anyhow::Result<()> {
         .collect_rollouts(collect_config(0..4), library()?)
         .await?;
     server.begin_shutdown();
-    let status = refusal(running).await?;
+    let status = refusal(Ok(running)).await?;
     assert_eq!(status.code(), Code::Unavailable, "{status:?}");
     let error = within("the end", learner.snapshot())
         .await?
@@ -556,20 +689,22 @@ fn collect_config(environments: std::ops::Range<u64>) -> CollectRolloutsConfig {
         environments: (environments.end - environments.start) as u32,
         first_environment: environments.start,
         seed: 11,
-        environment_settings: serde_json::json!({ "episode_frames": 20 }).to_string(),
+        environment: Some(EnvironmentSettings {
+            episode_frames: Some(20),
+            ..EnvironmentSettings::default()
+        }),
         ..CollectRolloutsConfig::default()
     }
 }
 
-fn collect_request(policy: &Policy, iteration: u64) -> anyhow::Result<CollectRequest> {
-    Ok(CollectRequest {
+fn collect_request(iteration: u64) -> CollectRequest {
+    CollectRequest {
         iteration,
-        policy: policy.encode()?,
         log_standard_deviation: vec![-1.0; 12],
         horizon: 24,
         randomization: 0.5,
         difficulty: 0.8,
-    })
+    }
 }
 
 fn collector(environments: std::ops::Range<u64>) -> anyhow::Result<Collector> {
@@ -620,6 +755,7 @@ fn assert_rollout(
 async fn rollouts_are_those_of_this_process_whoever_collects_them() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let policy = policy::load(&weights)?;
+    let bytes = policy.encode()?;
     let server = TestServer::start_with(weights.path(), |settings| {
         settings.rollouts.max_jobs = 2.try_into().expect("not zero");
         settings.rollouts.threads = 1;
@@ -640,16 +776,16 @@ async fn rollouts_are_those_of_this_process_whoever_collects_them() -> anyhow::R
             }
             here.set_curriculum(0.5, 0.8);
             let expected = here.collect(&policy, &[-1.0; 12], 24)?;
-            let request = collect_request(&policy, iteration)?;
-            let rollout = within("a rollout", learner.collect(request)).await??;
+            let request = collect_request(iteration);
+            let rollout = within("a rollout", learner.collect(&bytes, request)).await??;
             assert_rollout(&rollout, &expected, width);
         }
         here.restore(&snapshot)?;
         within("a restored snapshot", learner.restore(&snapshot)).await??;
         here.set_curriculum(0.5, 0.8);
         let expected = here.collect(&policy, &[-1.0; 12], 24)?;
-        let request = collect_request(&policy, 9)?;
-        let rollout = within("a rollout", learner.collect(request)).await??;
+        let request = collect_request(9);
+        let rollout = within("a rollout", learner.collect(&bytes, request)).await??;
         assert_rollout(&rollout, &expected, width);
     }
     Ok(())
@@ -676,6 +812,9 @@ async fn wrong_rollouts_are_refused_by_field() -> anyhow::Result<()> {
         change(&mut config);
         config
     };
+    let environment = |change: &dyn Fn(&mut EnvironmentSettings)| {
+        with(&|config| change(config.environment.as_mut().expect("settings")))
+    };
     let cases = [
         ("robot", with(&|config| config.robot = "nobody".to_owned())),
         (
@@ -683,12 +822,33 @@ async fn wrong_rollouts_are_refused_by_field() -> anyhow::Result<()> {
             with(&|config| config.environments = 0),
         ),
         (
-            "config.environment_settings",
-            with(&|config| config.environment_settings = "{\"episode_farms\": 1}".to_owned()),
+            "config.environment.rewards[0].term",
+            environment(&|settings| {
+                settings.rewards.push(RewardWeight {
+                    term: "applause".to_owned(),
+                    weight: 1.0,
+                });
+            }),
         ),
         (
-            "config.environment_settings",
-            with(&|config| config.environment_settings = "{\"episode_frames\": 0}".to_owned()),
+            "config.environment.episode_frames",
+            environment(&|settings| settings.episode_frames = Some(0)),
+        ),
+        (
+            "config.environment.tilt_limit",
+            environment(&|settings| settings.tilt_limit = Some(f64::NAN)),
+        ),
+        (
+            "config.environment.randomization.friction.most",
+            environment(&|settings| {
+                settings.randomization = Some(EnvironmentRandomization {
+                    friction: Some(Range {
+                        least: 0.0,
+                        most: 1e300,
+                    }),
+                    ..EnvironmentRandomization::default()
+                });
+            }),
         ),
         (
             "config.first_environment",
@@ -715,31 +875,32 @@ async fn wrong_rollouts_are_refused_by_field() -> anyhow::Result<()> {
         bytes[at..at + 5].copy_from_slice(b"emp99");
         bytes
     };
-    let good = collect_request(&policy, 0)?;
+    let good = collect_request(0);
+    let bytes = policy.encode()?;
     let requests = [
-        (
-            "collect.policy",
-            CollectRequest {
-                policy: vec![1, 2, 3],
-                ..good.clone()
-            },
-        ),
-        (
-            "collect.policy",
-            CollectRequest {
-                policy: other_robot,
-                ..good.clone()
-            },
-        ),
+        ("policy", vec![1, 2, 3], good.clone()),
+        ("policy", other_robot, good.clone()),
+        // No policy at all.
+        ("policy", Vec::new(), good.clone()),
         (
             "collect.log_standard_deviation",
+            bytes.clone(),
             CollectRequest {
                 log_standard_deviation: vec![0.0; 3],
                 ..good.clone()
             },
         ),
         (
+            "collect.log_standard_deviation[0]",
+            bytes.clone(),
+            CollectRequest {
+                log_standard_deviation: vec![3e38; 12],
+                ..good.clone()
+            },
+        ),
+        (
             "collect.horizon",
+            bytes.clone(),
             CollectRequest {
                 horizon: 0,
                 ..good.clone()
@@ -747,17 +908,18 @@ async fn wrong_rollouts_are_refused_by_field() -> anyhow::Result<()> {
         ),
         (
             "collect.difficulty",
+            bytes.clone(),
             CollectRequest {
                 difficulty: f64::NAN,
                 ..good
             },
         ),
     ];
-    for (field, request) in requests {
+    for (field, policy, request) in requests {
         let mut learner = client
             .collect_rollouts(collect_config(0..2), library()?)
             .await?;
-        let error = within("a refusal", learner.collect(request))
+        let error = within("a refusal", learner.collect(&policy, request))
             .await?
             .expect_err("refused");
         let ClientError::Status(status) = error else {

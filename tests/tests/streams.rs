@@ -134,39 +134,6 @@ async fn latest_keeps_the_newest_frame_and_reports_the_others() -> anyhow::Resul
 }
 
 #[tokio::test]
-async fn latest_replaces_a_frame_that_waits_in_the_models_queue() -> anyhow::Result<()> {
-    let gate = Gate::closed();
-    let server = fake::server(Settings::default(), &gate)?;
-    let client = Client::connect(&server.url()).await?;
-    let config = StreamConfig {
-        delivery: Delivery::Latest,
-        ..StreamConfig::for_robot("emp27")
-    };
-    let (mut busy, _busy_events) = client.stream(config.clone()).await?;
-    busy.send(&fake::pose(0.0), None).await?;
-    within("the model to be busy", gate.has_entered(1)).await?;
-    let (mut sender, mut events) = client.stream(config).await?;
-    for number in 0..3_u8 {
-        sender
-            .send(&fake::pose(f32::from(number) / 10.0), None)
-            .await?;
-    }
-    for number in 0..2 {
-        let Some(Event::Dropped(dropped)) = next(&mut events).await? else {
-            panic!("frame {number} not superseded")
-        };
-        assert_eq!(dropped.sequence_number, number);
-    }
-    gate.let_batches_pass();
-    let Some(Event::Answer(answer)) = next(&mut events).await? else {
-        panic!("no answer")
-    };
-    assert_eq!((answer.sequence_number, answer.joint_angles[0]), (2, 0.2));
-    assert_eq!(gate.entered(), 2, "each stream cost the model one frame");
-    Ok(())
-}
-
-#[tokio::test]
 async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyhow::Result<()> {
     let server = fake::server(Settings::default(), &Gate::open())?;
     let client = server.raw_client().await?;
@@ -228,7 +195,7 @@ async fn bad_frames_between_good_ones_are_dropped_and_the_stream_lives() -> anyh
         let header = match message {
             Message::Result(answered) => answered.header,
             Message::Dropped(dropped) => dropped.header,
-            Message::Started(_) => None,
+            Message::Started(_) | Message::GoingAway(_) => None,
         };
         numbers.push(header.expect("a header").sequence_number);
     }
@@ -266,6 +233,60 @@ async fn a_bad_config_ends_the_stream() -> anyhow::Result<()> {
     stream.finish();
     let status = stream.next().await?.expect_err("no config");
     assert_eq!(status.code(), Code::InvalidArgument);
+    Ok(())
+}
+
+#[tokio::test]
+async fn silence_ends_a_stream() -> anyhow::Result<()> {
+    let mut settings = Settings::default();
+    settings.streams.config_seconds = 0.2;
+    settings.streams.idle_seconds = 0.4;
+    settings.streams.max_open = 1.try_into()?;
+    let server = fake::server(settings, &Gate::open())?;
+    let client = server.raw_client().await?;
+    for starts in [false, true] {
+        let mut stream = open(&client).await?;
+        if starts {
+            stream.send(config("emp27", 0)).await;
+            let first = stream.next().await??;
+            assert!(matches!(first, Some(Message::Started(_))), "{first:?}");
+        }
+        let (_, status) = stream.failure().await?;
+        assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+        let info = status.get_error_details();
+        assert_eq!(info.error_info().expect("ErrorInfo").reason, "SILENT");
+        // Its place is free again for the next.
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn time_budgets_at_their_extremes_are_answered() -> anyhow::Result<()> {
+    let server = fake::server(Settings::default(), &Gate::open())?;
+    let client = server.raw_client().await?;
+    let mut stream = started(&client, Delivery::All).await?;
+    for (number, (seconds, nanos, is_good)) in (0..).zip([
+        (i64::MIN, 0, false),
+        (-1, 0, false),
+        (0, i32::MIN, false),
+        (i64::MAX, 0, true),
+    ]) {
+        let mut header = raw::header(number);
+        header.time_budget = Some(prost_types::Duration { seconds, nanos });
+        stream
+            .send(Outgoing::Frame(RetargetFrame {
+                header: Some(header),
+                pose: Some(raw::pose(&fake::pose(0.25))),
+            }))
+            .await;
+        match stream.next().await?? {
+            Some(Message::Result(_)) if is_good => {}
+            Some(Message::Dropped(dropped)) if !is_good => {
+                assert_eq!(dropped.field, "header.time_budget");
+            }
+            other => panic!("{seconds} s, {nanos} ns: {other:?}"),
+        }
+    }
     Ok(())
 }
 

@@ -2,23 +2,29 @@
 
 use std::{
     process::{Command, Stdio},
-    sync::Arc,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
     time::Duration,
 };
 
 use emp_client::{
-    ChangeReason, Client, ClientError, Delivery, EmpMode, Event, FrameSender, GoalPhase,
-    GuardReport, PoseSender, RampCause, SessionEvent, SessionEvents, StreamEvents,
-    TeleoperatedFrame, TeleoperationAnswer, TeleoperationConfig, TeleoperationFrame,
-    TeleoperationPresence,
+    ChangeReason, Client, ClientError, ControlCommand, ControlRequest, EmpMode, Event, FrameSender,
+    GoalPhase, GuardReport, OperatorInput, PoseSender, RampCause, SessionEvent, SessionEvents,
+    SessionPresence, SessionState, StreamEvents, TeleoperatedFrame, TeleoperationAnswer,
+    TeleoperationConfig, TeleoperationFrame,
 };
 use emp_motion::{KeyNodeFrame, key_nodes, skills};
 use emp_proto::v1::{
-    self, DropReason, FrameHeader, HumanPose, RobotState, TeleoperateConfig, TeleoperateRequest,
-    TeleoperateResponse, TeleoperationRole, teleoperate_request::Message as Request,
-    teleoperate_response::Message as Response,
+    BothConfig, BothFrame, DropReason, FrameHeader, HumanPose, ObserveRequest, ObserverConfig,
+    OperatorConfig, OperatorFrame, RobotConfig, RobotFrame, RobotState, TeleoperateConfig,
+    TeleoperateRequest, TeleoperateResponse, observe_response, teleoperate_config::Role,
+    teleoperate_request::Message as Request, teleoperate_response::Message as Response,
+    teleoperation_service_client::TeleoperationServiceClient,
 };
 use emp_robot::Robot;
+use emp_server::{Catalog, Settings};
 use emp_sim::{Body, BodyParameters, Stage, Start, Targets};
 use emp_tests::{
     TestServer, assert_near, emp, emp27, fake, policy,
@@ -33,6 +39,7 @@ use tonic::{Code, Status};
 
 /// Control periods of a ramp of the test server.
 const RAMP: usize = 10;
+const PERIOD: Duration = Duration::from_millis(20);
 const STALE: Duration = Duration::from_millis(500);
 /// Rounding of angles, rad.
 const TOLERANCE: f32 = 1e-5;
@@ -68,11 +75,19 @@ fn still(robot: &Robot, offset: f32) -> TeleoperationFrame {
         *angle += offset;
     }
     TeleoperationFrame {
-        pose: None,
+        operator: None,
         joint_positions,
         orientation: UnitQuaternion::identity(),
+        measured: None,
         reset: false,
-        emp_mode: EmpMode::Unspecified,
+    }
+}
+
+/// The same with a person's pose.
+fn with_pose(frame: &TeleoperationFrame, pose: &KeyNodeFrame) -> TeleoperationFrame {
+    TeleoperationFrame {
+        operator: Some(OperatorInput::pose(pose)),
+        ..frame.clone()
     }
 }
 
@@ -85,25 +100,52 @@ fn pose(angle: f32) -> KeyNodeFrame {
     fake::pose(angle)
 }
 
+/// A tremor, as every person and every sensor has one: it is never the same twice in a row.
+fn tremor() -> f32 {
+    static COUNT: AtomicU32 = AtomicU32::new(0);
+    1e-5 * (COUNT.fetch_add(1, Ordering::Relaxed) % 2) as f32
+}
+
 /// The end of a session with the robot.
 struct RobotEnd {
     sender: FrameSender<TeleoperationFrame>,
     events: StreamEvents<TeleoperationAnswer>,
+    /// A simulated robot's clock.
+    clock: Option<Duration>,
 }
 
 impl RobotEnd {
     async fn join(client: &Client, session: &str) -> anyhow::Result<Self> {
         let (sender, events) = client.join_as_robot(config(session)).await?;
-        Ok(Self { sender, events })
+        Ok(Self {
+            sender,
+            events,
+            clock: None,
+        })
     }
 
+    /// Both ends, with a robot that is simulated in step with the answers.
     async fn both(client: &Client, config: TeleoperationConfig) -> anyhow::Result<Self> {
+        let config = TeleoperationConfig {
+            simulated: true,
+            ..config
+        };
         let (sender, events) = client.teleoperate(config).await?;
-        Ok(Self { sender, events })
+        Ok(Self {
+            sender,
+            events,
+            clock: Some(Duration::ZERO),
+        })
     }
 
     async fn step(&mut self, frame: &TeleoperationFrame) -> anyhow::Result<TeleoperatedFrame> {
-        let number = self.sender.send(frame, None).await?;
+        let mut frame = frame.clone();
+        frame.orientation *= UnitQuaternion::from_euler_angles(0.0, 0.0, f64::from(tremor()));
+        if let Some(clock) = &mut self.clock {
+            *clock += PERIOD;
+            frame.measured = Some(*clock);
+        }
+        let number = self.sender.send(&frame, None).await?;
         match within("an answer", self.events.next()).await?? {
             Some(Event::Answer(answer)) => {
                 assert_eq!(answer.sequence_number, number);
@@ -163,7 +205,7 @@ async fn next_executed(events: &mut SessionEvents) -> anyhow::Result<Teleoperate
     .await
 }
 
-async fn next_presence(events: &mut SessionEvents) -> anyhow::Result<TeleoperationPresence> {
+async fn next_presence(events: &mut SessionEvents) -> anyhow::Result<SessionPresence> {
     next(events, |event| match event {
         SessionEvent::Presence(presence) => Some(presence),
         _ => None,
@@ -171,8 +213,8 @@ async fn next_presence(events: &mut SessionEvents) -> anyhow::Result<Teleoperati
     .await
 }
 
-async fn send(operator: &mut PoseSender, pose: &KeyNodeFrame) -> anyhow::Result<()> {
-    operator.send(pose, EmpMode::Unspecified).await?;
+async fn send(operator: &mut PoseSender, angle: f32) -> anyhow::Result<()> {
+    operator.send(&pose(angle + tremor())).await?;
     Ok(())
 }
 
@@ -183,7 +225,7 @@ async fn arrive(
     frame: &TeleoperationFrame,
     angle: f32,
 ) -> anyhow::Result<TeleoperatedFrame> {
-    send(operator, &pose(angle)).await?;
+    send(operator, angle).await?;
     for _ in 0..1_000 {
         let result = end.step(frame).await?;
         let phase = guard(&result).phase();
@@ -203,7 +245,7 @@ async fn follow(
     angle: f32,
 ) -> anyhow::Result<TeleoperatedFrame> {
     for _ in 0..1_000 {
-        send(operator, &pose(angle)).await?;
+        send(operator, angle).await?;
         let result = end.step(frame).await?;
         if guard(&result).phase() == GoalPhase::Following {
             return Ok(result);
@@ -220,12 +262,12 @@ async fn one_client_with_both_ends_gets_the_whole_path() -> anyhow::Result<()> {
     let mut end = RobotEnd::both(&client, config("")).await?;
     assert_eq!(end.events.joint_names().len(), 27);
     assert_eq!(end.events.model().0, "emp27-policy");
-    let mut frame = still(&robot, 0.05);
-    frame.pose = Some(pose(0.4));
+    let frame = with_pose(&still(&robot, 0.05), &pose(0.4));
     let retargeted = client.retarget("emp27", &pose(0.4), false).await?;
     let first = end.step(&frame).await?;
     assert_near(&first.goal, &measured(&frame), TOLERANCE);
     assert_near(executed(&first), &measured(&frame), TOLERANCE);
+    assert_eq!(first.state(), SessionState::Active);
     assert_eq!(guard(&first).phase(), GoalPhase::Ramping);
     assert_eq!(guard(&first).cause(), RampCause::FirstFrame);
     assert_eq!(first.emp_mode(), EmpMode::On);
@@ -374,8 +416,7 @@ async fn observers_are_told_what_the_robot_executes() -> anyhow::Result<()> {
         client.observe(config("lab")).await?,
     ];
     let mut end = RobotEnd::both(&client, config("lab")).await?;
-    let mut frame = still(&robot, 0.0);
-    frame.pose = Some(pose(0.3));
+    let frame = with_pose(&still(&robot, 0.0), &pose(0.3));
     let mut results = Vec::new();
     for _ in 0..5 {
         results.push(end.step(&frame).await?);
@@ -428,17 +469,16 @@ async fn a_robot_that_was_silent_is_ramped_from_its_measured_pose() -> anyhow::R
     let (server, _weights) = server()?;
     let robot = emp27()?;
     let client = Client::connect(&server.url()).await?;
-    let mut end = RobotEnd::both(&client, config("")).await?;
-    let mut frame = still(&robot, 0.0);
-    frame.pose = Some(pose(0.4));
-    end.until(&frame, GoalPhase::Following).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let (mut operator, _events) = client.operate(config("lab")).await?;
+    let frame = still(&robot, 0.0);
+    follow(&mut operator, &mut end, &frame, 0.4).await?;
     tokio::time::sleep(STALE + Duration::from_millis(100)).await;
     let mut frame = still(&robot, 0.2);
-    frame.pose = Some(pose(0.4));
-    let resumed = end.step(&frame).await?;
+    let resumed = arrive(&mut operator, &mut end, &frame, 0.4).await?;
     assert_eq!(guard(&resumed).cause(), RampCause::RobotResumed);
     assert_near(executed(&resumed), &measured(&frame), TOLERANCE);
-    end.until(&frame, GoalPhase::Following).await?;
+    follow(&mut operator, &mut end, &frame, 0.4).await?;
     frame.reset = true;
     let reset = end.step(&frame).await?;
     assert_eq!(guard(&reset).cause(), RampCause::FirstFrame);
@@ -452,7 +492,7 @@ async fn a_switch_of_the_emps_mode_is_blended() -> anyhow::Result<()> {
     let robot = emp27()?;
     let client = Client::connect(&server.url()).await?;
     let off = TeleoperationConfig {
-        emp_mode: EmpMode::Off,
+        emp_mode: Some(EmpMode::Off),
         ..config("lab")
     };
     let mut end = RobotEnd::join(&client, "lab").await?;
@@ -461,32 +501,38 @@ async fn a_switch_of_the_emps_mode_is_blended() -> anyhow::Result<()> {
     let mut last = follow(&mut operator, &mut end, &frame, 0.3).await?;
     assert_eq!(last.emp_mode(), EmpMode::Off);
     assert_near(executed(&last), &last.goal, TOLERANCE);
-    // The operator switches it on, the robot off again.
-    operator.send(&pose(0.3), EmpMode::On).await?;
+    // The operator switches it on, a controller off again.
+    let switch = OperatorInput {
+        emp_mode: Some(EmpMode::On),
+        ..OperatorInput::pose(&pose(0.3 + tremor()))
+    };
+    operator.send_input(&switch).await?;
     while last.emp_mode() != EmpMode::On {
-        send(&mut operator, &pose(0.3)).await?;
+        send(&mut operator, 0.3).await?;
         let result = end.step(&frame).await?;
         if result.emp_mode() == EmpMode::On {
-            assert_near(executed(&result), executed(&last), TOLERANCE);
+            assert_near(executed(&result), executed(&last), 1e-3);
             assert_eq!(guard(&result).emp_progress, Some(0.0));
         }
         last = result;
     }
     let mut periods = 1;
     while guard(&last).emp_progress.is_some() {
-        send(&mut operator, &pose(0.3)).await?;
+        send(&mut operator, 0.3).await?;
         last = end.step(&frame).await?;
         periods += 1;
     }
-    assert!(periods > RAMP);
+    assert!(periods >= RAMP / 2, "{periods}");
     let corrected = last.filter.clone().expect("a filter's result");
     assert!(corrected.change.iter().any(|change| change.abs() > 0.01));
-    let switch = TeleoperationFrame {
-        emp_mode: EmpMode::Off,
-        ..frame.clone()
+    let off = ControlRequest {
+        session: "lab".to_owned(),
+        emp_mode: Some(EmpMode::Off.into()),
+        ..ControlRequest::default()
     };
-    send(&mut operator, &pose(0.3)).await?;
-    let result = end.step(&switch).await?;
+    client.control(off).await?;
+    send(&mut operator, 0.3).await?;
+    let result = end.step(&frame).await?;
     assert_eq!(result.emp_mode(), EmpMode::Off);
     assert_eq!(guard(&result).emp_progress, Some(0.0));
     assert_near(executed(&result), &corrected.executable_goal, 0.02);
@@ -499,15 +545,15 @@ async fn a_jump_of_the_pose_is_limited_in_speed() -> anyhow::Result<()> {
     let robot = emp27()?;
     let client = Client::connect(&server.url()).await?;
     let off = TeleoperationConfig {
-        emp_mode: EmpMode::Off,
+        emp_mode: Some(EmpMode::Off),
         ..config("")
     };
     let mut end = RobotEnd::both(&client, off).await?;
-    let mut frame = still(&robot, 0.0);
-    frame.pose = Some(pose(-0.5));
-    let before = end.until(&frame, GoalPhase::Following).await?;
-    frame.pose = Some(pose(0.5));
-    let jump = end.step(&frame).await?;
+    let frame = still(&robot, 0.0);
+    let before = end
+        .until(&with_pose(&frame, &pose(-0.5)), GoalPhase::Following)
+        .await?;
+    let jump = end.step(&with_pose(&frame, &pose(0.5))).await?;
     assert_eq!(guard(&jump).phase(), GoalPhase::Following);
     let limited = guard(&jump).speed_limited_joints;
     assert!(!limited.is_empty());
@@ -518,7 +564,7 @@ async fn a_jump_of_the_pose_is_limited_in_speed() -> anyhow::Result<()> {
         let largest = (joint.velocity_limit / robot.control_rate_hz()) as f32;
         assert!(step <= largest + TOLERANCE);
         assert_eq!(
-            limited.contains(&joint.name),
+            limited.contains(&(index as u32)),
             executed(&jump)[index] != jump.goal[index]
         );
     }
@@ -529,10 +575,16 @@ type RawSession = RawStream<TeleoperateRequest, TeleoperateResponse>;
 
 /// Joins a session as any gRPC client would.
 async fn open(server: &TestServer, config: TeleoperateConfig) -> anyhow::Result<RawSession> {
-    let mut client = server.raw_client().await?;
+    let mut client = raw_client(server).await?;
     let stream = RawStream::open(async |requests| client.teleoperate(requests).await).await?;
     stream.send(Request::Config(config)).await;
     Ok(stream)
+}
+
+async fn raw_client(
+    server: &TestServer,
+) -> anyhow::Result<TeleoperationServiceClient<tonic::transport::Channel>> {
+    Ok(TeleoperationServiceClient::connect(server.url()).await?)
 }
 
 /// [`open`] for a config that is accepted.
@@ -541,13 +593,6 @@ async fn started(server: &TestServer, config: TeleoperateConfig) -> anyhow::Resu
     let first = stream.next().await?;
     assert!(matches!(first, Ok(Some(Response::Started(_)))), "{first:?}");
     Ok(stream)
-}
-
-async fn send_frame(stream: &RawSession, number: u64, mut frame: v1::TeleoperationFrame) {
-    let mut header = frame.header.unwrap_or_default();
-    header.sequence_number = number;
-    frame.header = Some(header);
-    stream.send(Request::Frame(frame)).await;
 }
 
 /// The next message that does not tell who came or went, which may come at any time.
@@ -562,25 +607,45 @@ async fn next_but_presence(
     }
 }
 
-fn raw_config(session: &str, role: TeleoperationRole) -> TeleoperateConfig {
+fn raw_config(session: &str, role: Role) -> TeleoperateConfig {
     TeleoperateConfig {
         session: session.to_owned(),
-        role: role.into(),
         robot: "emp27".to_owned(),
+        role: Some(role),
         ..TeleoperateConfig::default()
     }
+}
+
+fn robot_role() -> Role {
+    Role::RobotEnd(RobotConfig::default())
+}
+
+fn operator_role() -> Role {
+    Role::Operator(OperatorConfig::default())
+}
+
+fn observer_role() -> Role {
+    Role::Observer(ObserverConfig {})
 }
 
 fn raw_state(frame: &TeleoperationFrame) -> RobotState {
     raw::state(&frame.joint_positions, &frame.orientation)
 }
 
-fn frame_of(pose: Option<HumanPose>, state: Option<RobotState>) -> v1::TeleoperationFrame {
-    v1::TeleoperationFrame {
-        pose,
+fn robot_frame(number: u64, state: Option<RobotState>) -> Request {
+    Request::Robot(RobotFrame {
+        header: Some(raw::header(number)),
         state,
-        ..v1::TeleoperationFrame::default()
-    }
+        reset: false,
+    })
+}
+
+fn operator_frame(number: u64, pose: Option<HumanPose>) -> Request {
+    Request::Operator(OperatorFrame {
+        header: Some(raw::header(number)),
+        pose,
+        ..OperatorFrame::default()
+    })
 }
 
 #[tokio::test]
@@ -588,20 +653,24 @@ async fn a_bad_config_is_refused_by_name() -> anyhow::Result<()> {
     let weights = policy::weights()?;
     let server = server_with(&weights)?;
     type Change = fn(&mut TeleoperateConfig);
-    let bad: [(&str, Change); 8] = [
-        ("config.role", |config| config.role = 9),
+    let bad: [(&str, Change); 7] = [
+        ("config.role", |config| config.role = None),
         ("config.session", |config| config.session.clear()),
         ("config.session", |config| config.session = "x".repeat(65)),
-        ("config.delivery", |config| config.delivery = 9),
-        ("config.emp_mode", |config| config.emp_mode = 9),
+        ("config.emp_mode", |config| config.emp_mode = Some(9)),
         ("config.emp_mode", |config| {
-            config.emp_mode = EmpMode::On.into();
+            config.emp_mode = Some(EmpMode::On.into());
         }),
         ("robot", |config| config.robot = "nobody".to_owned()),
-        ("model", |config| config.retargeter = "nothing".to_owned()),
+        ("model", |config| {
+            config.role = Some(Role::Operator(OperatorConfig {
+                retargeter: "nothing".to_owned(),
+                ..OperatorConfig::default()
+            }));
+        }),
     ];
     for (field, change) in bad {
-        let mut config = raw_config("lab", TeleoperationRole::Robot);
+        let mut config = raw_config("lab", robot_role());
         change(&mut config);
         let mut stream = open(&server, config).await?;
         let status = stream.next().await?.expect_err("refused");
@@ -620,20 +689,25 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
     let with_state = |change: &dyn Fn(&mut RobotState)| {
         let mut state = raw_state(&good);
         change(&mut state);
-        frame_of(None, Some(state))
+        robot_frame(7, Some(state))
     };
     let broken_pose = || {
         let mut pose = raw::pose(&pose(0.3));
         pose.left_elbow.as_mut().expect("an elbow").x = f32::NAN;
         Some(pose)
     };
-    let mode = |frame: v1::TeleoperationFrame| v1::TeleoperationFrame {
-        emp_mode: EmpMode::On.into(),
-        ..frame
+    let head_and_hands = || {
+        let whole = raw::pose(&pose(0.3));
+        Some(HumanPose {
+            head: whole.torso,
+            left_wrist: whole.left_wrist,
+            right_wrist: whole.right_wrist,
+            ..HumanPose::default()
+        })
     };
     let robots = vec![
-        ("state", frame_of(None, None)),
-        ("pose", frame_of(person(), Some(raw_state(&good)))),
+        ("state", robot_frame(7, None)),
+        ("operator", operator_frame(7, person())),
         (
             "state.joint_positions",
             with_state(&|state| state.joint_positions.truncate(26)),
@@ -643,34 +717,52 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
             with_state(&|state| state.joint_positions[2] = f32::NAN),
         ),
         (
+            "state.joint_velocities",
+            with_state(&|state| state.joint_velocities = vec![0.0; 3]),
+        ),
+        (
+            "state.joint_velocities[26]",
+            with_state(&|state| {
+                state.joint_velocities = vec![0.0; 27];
+                state.joint_velocities[26] = 1e9;
+            }),
+        ),
+        (
+            "state.measurement_time",
+            with_state(&|state| {
+                let (seconds, nanos) = (i64::MIN, 0);
+                state.measurement_time = Some(prost_types::Duration { seconds, nanos });
+            }),
+        ),
+        (
             "state.base_orientation",
             with_state(&|state| state.base_orientation = None),
         ),
-        ("emp_mode", mode(frame_of(None, Some(raw_state(&good))))),
     ];
     let operators = vec![
-        ("pose", frame_of(None, None)),
-        ("state", frame_of(person(), Some(raw_state(&good)))),
-        ("pose.left_elbow.x", frame_of(broken_pose(), None)),
-        ("emp_mode", mode(frame_of(person(), None))),
-    ];
-    let both = vec![
-        ("state", frame_of(person(), None)),
+        ("pose", operator_frame(7, None)),
+        ("robot", robot_frame(7, Some(raw_state(&good)))),
+        ("pose.left_elbow.x", operator_frame(7, broken_pose())),
+        ("pose.waist", operator_frame(7, head_and_hands())),
         (
-            "pose.left_elbow.x",
-            frame_of(broken_pose(), Some(raw_state(&good))),
+            "emp_mode",
+            Request::Operator(OperatorFrame {
+                header: Some(raw::header(7)),
+                pose: person(),
+                emp_mode: Some(EmpMode::On.into()),
+                ..OperatorFrame::default()
+            }),
         ),
     ];
-    let observers = vec![("frame", frame_of(person(), None))];
+    let observers = vec![("operator", operator_frame(7, person()))];
     for (role, frames) in [
-        (TeleoperationRole::Robot, robots),
-        (TeleoperationRole::Operator, operators),
-        (TeleoperationRole::Both, both),
-        (TeleoperationRole::Observer, observers),
+        (robot_role(), robots),
+        (operator_role(), operators),
+        (observer_role(), observers),
     ] {
-        let mut stream = started(&server, raw_config("lab", role)).await?;
-        for (number, (field, frame)) in frames.into_iter().enumerate() {
-            send_frame(&stream, number as u64, frame).await;
+        let mut stream = started(&server, raw_config("lab", role.clone())).await?;
+        for (field, frame) in frames {
+            stream.send(frame).await;
             let answer = next_but_presence(&mut stream).await?;
             let Ok(Some(Response::Dropped(dropped))) = answer else {
                 panic!("{role:?}: {field} is not refused but {answer:?}")
@@ -679,13 +771,10 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
                 (dropped.reason(), dropped.field.as_str()),
                 (DropReason::Invalid, field)
             );
-            assert_eq!(
-                dropped.header.unwrap_or_default().sequence_number,
-                number as u64
-            );
+            assert_eq!(dropped.header.unwrap_or_default().sequence_number, 7);
         }
-        if matches!(role, TeleoperationRole::Robot | TeleoperationRole::Both) {
-            send_frame(&stream, 99, frame_of(None, Some(raw_state(&good)))).await;
+        if matches!(role, Role::RobotEnd(_)) {
+            stream.send(robot_frame(99, Some(raw_state(&good)))).await;
             let answer = next_but_presence(&mut stream).await?;
             assert!(
                 matches!(answer, Ok(Some(Response::Result(_)))),
@@ -693,6 +782,28 @@ async fn a_bad_frame_is_named_and_the_stream_lives_on() -> anyhow::Result<()> {
             );
         }
     }
+    // Of a client with both ends, a bad pose does not keep the robot from its answer.
+    let config = raw_config("", Role::Both(BothConfig::default()));
+    let mut stream = started(&server, config).await?;
+    let both = |number, pose| {
+        Request::Both(BothFrame {
+            robot: Some(RobotFrame {
+                header: Some(raw::header(number)),
+                state: Some(raw_state(&good)),
+                reset: false,
+            }),
+            operator: Some(OperatorFrame {
+                pose,
+                ..OperatorFrame::default()
+            }),
+        })
+    };
+    stream.send(both(0, broken_pose())).await;
+    let Ok(Some(Response::Result(result))) = stream.next().await? else {
+        panic!("no answer")
+    };
+    let dropped = result.pose.expect("a report").dropped.expect("a notice");
+    assert_eq!(dropped.field, "operator.pose.left_elbow.x");
     Ok(())
 }
 
@@ -702,15 +813,17 @@ async fn a_pose_that_cannot_be_retargeted_in_time_is_not_used() -> anyhow::Resul
     let server = server_with(&weights)?;
     let client = Client::connect(&server.url()).await?;
     let mut end = RobotEnd::join(&client, "lab").await?;
-    let operator = started(&server, raw_config("lab", TeleoperationRole::Operator)).await?;
-    let late = v1::TeleoperationFrame {
-        header: Some(FrameHeader {
-            time_budget: Some(prost_types::Duration::default()),
-            ..FrameHeader::default()
-        }),
-        ..frame_of(Some(raw::pose(&pose(0.3))), None)
-    };
-    send_frame(&operator, 7, late).await;
+    let operator = started(&server, raw_config("lab", operator_role())).await?;
+    operator
+        .send(Request::Operator(OperatorFrame {
+            header: Some(FrameHeader {
+                time_budget: Some(prost_types::Duration::default()),
+                ..raw::header(7)
+            }),
+            pose: Some(raw::pose(&pose(0.3))),
+            ..OperatorFrame::default()
+        }))
+        .await;
     let frame = still(&*emp27()?, 0.0);
     loop {
         let result = end.step(&frame).await?;
@@ -732,24 +845,25 @@ async fn a_pose_that_cannot_be_retargeted_in_time_is_not_used() -> anyhow::Resul
 }
 
 #[tokio::test]
-async fn with_latest_every_frame_is_answered_or_superseded() -> anyhow::Result<()> {
+async fn every_frame_of_a_robot_is_answered_or_superseded_and_gaps_are_counted()
+-> anyhow::Result<()> {
     let (server, _weights) = server()?;
     let frame = still(&*emp27()?, 0.0);
-    let config = TeleoperateConfig {
-        delivery: Delivery::Latest.into(),
-        ..raw_config("lab", TeleoperationRole::Robot)
-    };
-    let mut stream = started(&server, config).await?;
-    for number in 0..40 {
-        send_frame(&stream, number, frame_of(None, Some(raw_state(&frame)))).await;
+    let mut stream = started(&server, raw_config("lab", robot_role())).await?;
+    let numbers: Vec<u64> = (0..40).filter(|number| number % 8 != 5).collect();
+    for &number in &numbers {
+        stream
+            .send(robot_frame(number, Some(raw_state(&frame))))
+            .await;
     }
     stream.finish();
     let (mut seen, mut last) = (Vec::new(), None);
     while let Some(message) = stream.next().await?? {
         let header = match message {
             Response::Result(result) => {
-                last = result.header;
-                result.header
+                let header = result.header;
+                last = Some(result);
+                header
             }
             Response::Dropped(dropped) => {
                 assert_eq!(dropped.reason(), DropReason::Superseded);
@@ -759,58 +873,367 @@ async fn with_latest_every_frame_is_answered_or_superseded() -> anyhow::Result<(
         };
         seen.push(header.unwrap_or_default().sequence_number);
     }
-    assert_eq!(
-        last.map(|header| header.sequence_number),
-        Some(39),
-        "the newest is computed"
-    );
+    let last = last.expect("an answer");
+    let number = last.header.unwrap_or_default().sequence_number;
+    assert_eq!(number, 39, "the newest is computed");
+    assert_eq!(last.robot_frames_lost, 5);
     seen.sort_unstable();
-    assert_eq!(seen, (0..40).collect::<Vec<u64>>());
+    assert_eq!(seen, numbers);
     Ok(())
 }
 
 #[tokio::test]
 async fn an_observer_who_half_closed_still_hears() -> anyhow::Result<()> {
     let (server, _weights) = server()?;
-    let mut observer = started(&server, raw_config("lab", TeleoperationRole::Observer)).await?;
+    let mut observer = started(&server, raw_config("lab", observer_role())).await?;
     observer.finish();
+    // And so does one who cannot stream both ways.
+    let request = ObserveRequest {
+        session: "lab".to_owned(),
+        robot: String::new(),
+    };
+    let mut raw = raw_client(&server).await?;
+    let mut listener = raw.observe(request).await?.into_inner();
+    let first = within("a start", listener.message())
+        .await??
+        .expect("a start");
+    assert!(matches!(
+        first.message,
+        Some(observe_response::Message::Started(_))
+    ));
     let client = Client::connect(&server.url()).await?;
     let mut end = RobotEnd::join(&client, "lab").await?;
-    let presence = observer.next().await?;
-    assert!(matches!(presence, Ok(Some(Response::Presence(presence))) if presence.robot));
     let result = end.step(&still(&*emp27()?, 0.0)).await?;
-    assert_eq!(
-        observer.next().await?.map_err(|status| status.to_string()),
-        Ok(Some(Response::Result(result)))
-    );
+    let told = loop {
+        match observer.next().await? {
+            Ok(Some(Response::Result(told))) => break told,
+            Ok(Some(Response::Presence(_))) => {}
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(told, result);
+    let told = loop {
+        let message = within("a message", listener.message()).await??;
+        match message.expect("a message").message {
+            Some(observe_response::Message::Result(told)) => break told,
+            Some(observe_response::Message::Presence(_)) => {}
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(told, result);
+    let request = ObserveRequest {
+        session: "nowhere".to_owned(),
+        robot: String::new(),
+    };
+    let mut listener = raw.observe(request).await?.into_inner();
+    let status = within("an end", listener.message())
+        .await?
+        .expect_err("none");
+    assert_eq!(status.code(), Code::NotFound, "{status:?}");
     Ok(())
 }
 
 #[tokio::test]
-async fn a_server_that_drains_ends_every_end() -> anyhow::Result<()> {
-    let (server, _weights) = server()?;
+async fn a_server_that_drains_serves_its_robots_through_the_grace_time() -> anyhow::Result<()> {
+    let weights = emp::weights(&emp::small(&*emp27()?, 3.0))?;
+    let server = TestServer::start_with(weights.path(), |settings| {
+        settings.shutdown.grace_seconds = 2.0;
+    })?;
     let frame = still(&*emp27()?, 0.0);
     let mut streams = Vec::new();
-    for role in [
-        TeleoperationRole::Robot,
-        TeleoperationRole::Operator,
-        TeleoperationRole::Observer,
-    ] {
+    for role in [robot_role(), operator_role(), observer_role()] {
         streams.push(started(&server, raw_config("lab", role)).await?);
     }
-    send_frame(&streams[0], 0, frame_of(None, Some(raw_state(&frame)))).await;
-    let answer = match streams[0].next().await? {
-        Ok(Some(Response::Result(result))) => result,
-        other => panic!("{other:?}"),
-    };
-    assert_eq!(answer.leg_targets.len(), 12);
     server.begin_shutdown();
+    let mut robot = streams.remove(0);
+    let Ok(Some(Response::GoingAway(notice))) = next_but_presence(&mut robot).await? else {
+        panic!("not told")
+    };
+    assert_eq!(notice.grace.expect("a time").seconds, 2);
+    for number in 0..20 {
+        robot
+            .send(robot_frame(number, Some(raw_state(&frame))))
+            .await;
+        let answer = next_but_presence(&mut robot).await?;
+        assert!(
+            matches!(answer, Ok(Some(Response::Result(_)))),
+            "{answer:?}"
+        );
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    streams.push(robot);
     for stream in &mut streams {
         let (_, status) = stream.failure().await?;
         assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+        let details = tonic_types::StatusExt::get_error_details(&status);
+        assert!(
+            details.retry_info().is_none(),
+            "another may be there at once"
+        );
     }
     drop(streams);
     assert_eq!(server.ended().await?, emp_server::Drain::Complete);
+    Ok(())
+}
+
+#[tokio::test]
+async fn states_that_queued_behind_a_stall_move_no_joint_further_than_the_time_allows()
+-> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let config = TeleoperateConfig {
+        emp_mode: Some(EmpMode::Off.into()),
+        ..raw_config("lab", robot_role())
+    };
+    let mut stream = started(&server, config).await?;
+    let (mut operator, _events) = client.operate(self::config("lab")).await?;
+    let mut number = 0;
+    let mut state = |robot: &Robot| {
+        let frame = still(robot, 0.0);
+        let mut state = raw_state(&frame);
+        number += 1;
+        let measured = PERIOD * u32::try_from(number).expect("a small number");
+        state.measurement_time = measured.try_into().ok();
+        state.joint_positions[0] += tremor();
+        robot_frame(number, Some(state))
+    };
+    async fn answer(stream: &mut RawSession) -> anyhow::Result<TeleoperatedFrame> {
+        loop {
+            match next_but_presence(stream).await? {
+                Ok(Some(Response::Result(result))) => return Ok(result),
+                Ok(Some(Response::Dropped(_))) => {}
+                other => panic!("{other:?}"),
+            }
+        }
+    }
+    // Followed at one pose, and then the person jumps to another.
+    let mut last = None;
+    for _ in 0..100 {
+        send(&mut operator, -0.5).await?;
+        stream.send(state(&robot)).await;
+        let result = answer(&mut stream).await?;
+        let phase = guard(&result).phase();
+        last = Some(result);
+        if phase == GoalPhase::Following {
+            break;
+        }
+        tokio::time::sleep(PERIOD).await;
+    }
+    let before = last.expect("an answer");
+    assert_eq!(guard(&before).phase(), GoalPhase::Following);
+    tokio::time::sleep(Duration::from_millis(250)).await;
+    send(&mut operator, 0.5).await?;
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    send(&mut operator, 0.5).await?;
+    for _ in 0..12 {
+        stream.send(state(&robot)).await;
+    }
+    let mut after = answer(&mut stream).await?;
+    while after.header.unwrap_or_default().sequence_number < number {
+        after = answer(&mut stream).await?;
+    }
+    let mut moved = false;
+    for (index, joint) in robot.goal_joints().iter().enumerate() {
+        let way = (executed(&after)[index] - executed(&before)[index]).abs();
+        // Two control periods, and the few milliseconds in which the twelve are answered.
+        let allowed = joint.velocity_limit as f32 * 0.08;
+        assert!(
+            way <= allowed,
+            "{}: {way} rad, allowed {allowed}",
+            joint.name
+        );
+        moved |= way > 0.0;
+    }
+    assert!(moved);
+    Ok(())
+}
+
+#[tokio::test]
+async fn legs_never_wait_for_the_arms() -> anyhow::Result<()> {
+    let weights = emp::weights(&emp::small(&*emp27()?, 3.0))?;
+    let settings = Settings {
+        weights: Some(weights.path().to_owned()),
+        robots: Some(emp_tests::root().join("robots")),
+        ..Settings::default()
+    };
+    let robot = emp27()?;
+    let gate = fake::Gate::closed();
+    let mut catalog = Catalog::load(&settings)?;
+    fake::add(&mut catalog, &settings, &robot, &gate)?;
+    let server = TestServer::start(settings, catalog)?;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let slow = TeleoperationConfig {
+        retargeter: "fake".to_owned(),
+        ..config("lab")
+    };
+    let (mut operator, _events) = client.operate(slow).await?;
+    send(&mut operator, 0.25).await?;
+    within("the retargeter to be busy", gate.has_entered(1)).await?;
+    let frame = still(&robot, 0.0);
+    for _ in 0..20 {
+        let result = end.step(&frame).await?;
+        assert_eq!(guard(&result).phase(), GoalPhase::Holding);
+        assert_eq!(result.leg_targets.len(), 12);
+    }
+    gate.let_batches_pass();
+    arrive(&mut operator, &mut end, &frame, 0.25).await?;
+    Ok(())
+}
+
+#[tokio::test]
+async fn sources_that_stand_still_are_stale_however_fresh_their_packets() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let (mut operator, _events) = client.operate(config("lab")).await?;
+    let frame = still(&robot, 0.0);
+    follow(&mut operator, &mut end, &frame, 0.3).await?;
+    // The same pose again and again.
+    let frozen = pose(0.3);
+    let mut phase = GoalPhase::Following;
+    for _ in 0..1_000 {
+        operator.send(&frozen).await?;
+        phase = guard(&end.step(&frame).await?).phase();
+        if phase == GoalPhase::Holding {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+    assert_eq!(phase, GoalPhase::Holding);
+    // The same state again and again.
+    follow(&mut operator, &mut end, &frame, 0.3).await?;
+    let mut report = GuardReport::default();
+    for _ in 0..1_000 {
+        send(&mut operator, 0.3).await?;
+        end.sender.send(&frame, None).await?;
+        let Some(Event::Answer(answer)) = within("an answer", end.events.next()).await?? else {
+            panic!("no answer")
+        };
+        report = guard(&answer.result);
+        if report.state_frozen {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+    assert!(report.state_frozen);
+    assert_eq!(report.phase(), GoalPhase::Holding);
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_person_lets_go_stops_and_starts_again() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let robot = emp27()?;
+    let client = Client::connect(&server.url()).await?;
+    let mut end = RobotEnd::join(&client, "lab").await?;
+    let (mut operator, mut events) = client.operate(config("lab")).await?;
+    let frame = still(&robot, 0.0);
+    let followed = follow(&mut operator, &mut end, &frame, 0.3).await?;
+    let let_go = |angle: f32| OperatorInput {
+        clutch: true,
+        ..OperatorInput::pose(&pose(angle + tremor()))
+    };
+    let mut held = followed.clone();
+    for _ in 0..200 {
+        operator.send_input(&let_go(-0.3)).await?;
+        held = end.step(&frame).await?;
+        if guard(&held).phase() == GoalPhase::Holding {
+            break;
+        }
+    }
+    assert_eq!(guard(&held).phase(), GoalPhase::Holding);
+    let back = arrive(&mut operator, &mut end, &frame, -0.3).await?;
+    assert_eq!(guard(&back).cause(), RampCause::OperatorReturned);
+    assert_near(&back.goal, &held.goal, 1e-3);
+
+    let stop = OperatorInput {
+        stop: true,
+        ..OperatorInput::default()
+    };
+    operator.send_input(&stop).await?;
+    let presence = next(&mut events, |event| match event {
+        SessionEvent::Presence(presence) => {
+            (presence.state() == SessionState::Stopped).then_some(presence)
+        }
+        _ => None,
+    })
+    .await?;
+    assert!(presence.robot);
+    let returning = end.until(&frame, GoalPhase::Returning).await?;
+    assert_eq!(returning.state(), SessionState::Stopped);
+    end.until(&frame, GoalPhase::Resting).await?;
+    send(&mut operator, 0.3).await?;
+    let resting = end.step(&frame).await?;
+    assert_eq!(
+        guard(&resting).phase(),
+        GoalPhase::Resting,
+        "until it is armed"
+    );
+    let arm = ControlRequest {
+        session: "lab".to_owned(),
+        command: ControlCommand::Arm.into(),
+        caution: Some(0.5),
+        ..ControlRequest::default()
+    };
+    let armed = client.control(arm.clone()).await?;
+    assert!(!armed.lease.is_empty());
+    assert_eq!(armed.session.expect("a session").caution, 0.5);
+    let refused = client.control(arm).await.expect_err("another's lease");
+    assert_eq!(refused.code(), Some(Code::FailedPrecondition), "{refused}");
+    follow(&mut operator, &mut end, &frame, 0.3).await?;
+
+    let sessions = client.sessions().await?;
+    assert_eq!(sessions.len(), 1);
+    assert!(sessions[0].controlled && sessions[0].periods > 0);
+    client.end_session("lab").await?;
+    let error = loop {
+        match within("the end", end.events.next()).await? {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("it ended well"),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!(error.code(), Some(Code::Aborted), "{error}");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_robot_that_comes_back_takes_its_seat_over() -> anyhow::Result<()> {
+    let (server, _weights) = server()?;
+    let frame = still(&*emp27()?, 0.0);
+    let mut first = open(&server, raw_config("lab", robot_role())).await?;
+    let Ok(Some(Response::Started(accepted))) = first.next().await? else {
+        panic!("not started")
+    };
+    assert!(!accepted.resume_token.is_empty());
+    first.send(robot_frame(0, Some(raw_state(&frame)))).await;
+    assert!(matches!(first.next().await?, Ok(Some(Response::Result(_)))));
+    let config = TeleoperateConfig {
+        resume_token: accepted.resume_token,
+        ..raw_config("lab", robot_role())
+    };
+    // Its old stream is still there as far as the server knows.
+    let second = started(&server, config).await?;
+    second.send(robot_frame(0, Some(raw_state(&frame)))).await;
+    let (_, status) = first.failure().await?;
+    assert_eq!(status.code(), Code::Aborted, "{status:?}");
+    // Nobody else gets it while it sends, anybody once it is silent.
+    let mut other = open(&server, raw_config("lab", robot_role())).await?;
+    let status = other.next().await?.expect_err("taken");
+    assert_eq!(status.code(), Code::AlreadyExists, "{status:?}");
+    let mut observer = started(&server, raw_config("lab", observer_role())).await?;
+    let silent = loop {
+        match observer.next().await? {
+            Ok(Some(Response::Presence(presence))) if presence.robot_silent => break presence,
+            Ok(Some(_)) => {}
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(silent.robot);
+    started(&server, raw_config("lab", robot_role())).await?;
     Ok(())
 }
 
@@ -835,11 +1258,11 @@ impl Simulated {
     fn frame(&self) -> TeleoperationFrame {
         let reading = self.body.reading();
         TeleoperationFrame {
-            pose: None,
+            operator: None,
             joint_positions: reading.joint_positions.clone(),
             orientation: reading.orientation,
+            measured: None,
             reset: false,
-            emp_mode: EmpMode::Unspecified,
         }
     }
 

@@ -37,6 +37,9 @@ pub(crate) fn run(workspace: &Workspace) -> Result<()> {
     steps.run("wire contract", || {
         workspace.run(workspace.command(tools.program("buf")).arg("lint"))
     });
+    steps.run("wire contract against the last release", || {
+        breaking(workspace, &tools)
+    });
     for robot in ["emp27", "g1"] {
         steps.run(&format!("demo on {robot}"), || demo_on(workspace, robot));
     }
@@ -96,6 +99,24 @@ fn fetch(workspace: &Workspace) -> Result<Tools> {
     mujoco::ensure(workspace)?;
     robots::ensure(workspace, FetchedRobot::G1)?;
     Tools::ensure(workspace)
+}
+
+/// Refuses changes of the contract that would break the clients of the last tag; without a tag there are none.
+fn breaking(workspace: &Workspace, tools: &Tools) -> Result<()> {
+    let described = workspace
+        .command("git")
+        .args(["describe", "--tags", "--abbrev=0"])
+        .stderr(Stdio::null())
+        .output()
+        .context("git describe")?;
+    let tag = String::from_utf8_lossy(&described.stdout).trim().to_owned();
+    if !described.status.success() || tag.is_empty() {
+        println!("skipped: nothing has been released yet (no git tag)");
+        return Ok(());
+    }
+    let against = format!(".git#tag={tag}");
+    let mut buf = workspace.command(tools.program("buf"));
+    workspace.run(buf.args(["breaking", "--against", &against]))
 }
 
 fn clippy(workspace: &Workspace) -> Result<()> {

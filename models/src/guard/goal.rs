@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use emp_robot::Robot;
 
-use super::{GuardSettings, Limits, Ramp};
+use super::{GuardSettings, Limits, Period, Ramp};
 
 /// Why the goal is being blended to the newest one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,6 +49,22 @@ pub struct GoalInput<'a> {
     pub age: Duration,
     /// The measured angles of the goal joints, rad.
     pub measured: &'a [f32],
+    /// What those who are responsible for the robot want.
+    pub wish: Wish,
+    /// How much time has passed for the robot, and how fast it may move.
+    pub period: Period,
+}
+
+/// What those who are responsible for a robot want it to do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Wish {
+    /// Follow the newest goal while it is fresh.
+    #[default]
+    Follow,
+    /// Hold the goal that stands, fresh or not.
+    Hold,
+    /// Go to the default pose, and stay there.
+    Rest,
 }
 
 /// Decides in each control period which goal is asked of the robot. One robot's; see the [module](super).
@@ -80,14 +96,17 @@ struct Blend {
 }
 
 impl Blend {
-    /// Moves `goal` on toward `to`; gives the progress.
-    fn step(&mut self, to: &[f32], goal: &mut [f32]) -> f32 {
+    /// Moves `goal` on toward `to`; gives the progress, or none once it is there.
+    fn step(&mut self, to: &[f32], elapsed: Duration, goal: &mut [f32]) -> Option<f32> {
+        self.ramp.advance(elapsed);
+        if self.ramp.is_finished() {
+            return None;
+        }
         let (progress, weight) = (self.ramp.progress(), self.ramp.weight());
         for ((goal, from), to) in goal.iter_mut().zip(&self.from).zip(to) {
             *goal = from + weight * (to - from);
         }
-        self.ramp.done += 1;
-        progress
+        Some(progress)
     }
 }
 
@@ -125,37 +144,41 @@ impl GoalGuard {
         if self.goal.is_empty() {
             self.goal = self.limits.inside(input.measured);
         }
-        let phase = match input.goal {
-            Some(newest) if input.age < self.settings.stale_after => self.follow(newest),
-            _ if input.age < self.settings.return_after => self.hold(),
-            _ => self.go_home(),
+        let period = self.limits.bounded(input.period);
+        let is_fresh = input.age < self.settings.stale_after;
+        let phase = match (input.wish, input.goal) {
+            (Wish::Rest, _) => self.go_home(period),
+            (Wish::Follow, Some(newest)) if is_fresh => self.follow(newest, period),
+            (Wish::Hold, _) => self.hold(period),
+            _ if input.age < self.settings.return_after => self.hold(period),
+            _ => self.go_home(period),
         };
         (&self.goal, phase)
     }
 
-    fn follow(&mut self, newest: &[f32]) -> GoalPhase {
+    fn follow(&mut self, newest: &[f32], period: Period) -> GoalPhase {
         let cause = match self.state {
             State::Due(cause) => Some(cause),
             State::Returning(_) | State::Resting => Some(RampCause::OperatorReturned),
             State::Ramping(..) | State::Following => None,
         };
         if let Some(cause) = cause {
-            self.state = State::Ramping(self.blend_to(newest), cause);
+            self.state = State::Ramping(self.blend_to(newest, period.speed), cause);
         }
-        match &mut self.state {
-            State::Ramping(blend, cause) if !blend.ramp.is_finished() => GoalPhase::Ramping {
+        if let State::Ramping(blend, cause) = &mut self.state
+            && let Some(progress) = blend.step(newest, period.elapsed, &mut self.goal)
+        {
+            return GoalPhase::Ramping {
                 cause: *cause,
-                progress: blend.step(newest, &mut self.goal),
-            },
-            _ => {
-                self.state = State::Following;
-                self.goal.copy_from_slice(newest);
-                GoalPhase::Following
-            }
+                progress,
+            };
         }
+        self.state = State::Following;
+        self.goal.copy_from_slice(newest);
+        GoalPhase::Following
     }
 
-    fn hold(&mut self) -> GoalPhase {
+    fn hold(&mut self, period: Period) -> GoalPhase {
         match &mut self.state {
             // A new robot, or an operator who stays away: nothing has changed since the last control period.
             State::Due(_) => GoalPhase::Holding,
@@ -163,30 +186,28 @@ impl GoalGuard {
                 self.state = State::Due(RampCause::OperatorReturned);
                 GoalPhase::Holding
             }
-            State::Returning(_) | State::Resting => self.go_home(),
+            State::Returning(_) | State::Resting => self.go_home(period),
         }
     }
 
-    fn go_home(&mut self) -> GoalPhase {
+    fn go_home(&mut self, period: Period) -> GoalPhase {
         if !matches!(self.state, State::Returning(_) | State::Resting) {
-            self.state = State::Returning(self.blend_to(&self.default));
+            self.state = State::Returning(self.blend_to(&self.default, period.speed));
         }
-        match &mut self.state {
-            State::Returning(blend) if !blend.ramp.is_finished() => GoalPhase::Returning {
-                progress: blend.step(&self.default, &mut self.goal),
-            },
-            _ => {
-                self.state = State::Resting;
-                self.goal.copy_from_slice(&self.default);
-                GoalPhase::Resting
-            }
+        if let State::Returning(blend) = &mut self.state
+            && let Some(progress) = blend.step(&self.default, period.elapsed, &mut self.goal)
+        {
+            return GoalPhase::Returning { progress };
         }
+        self.state = State::Resting;
+        self.goal.copy_from_slice(&self.default);
+        GoalPhase::Resting
     }
 
-    fn blend_to(&self, pose: &[f32]) -> Blend {
+    fn blend_to(&self, pose: &[f32], speed: f32) -> Blend {
         Blend {
             from: self.goal.clone(),
-            ramp: self.limits.ramp(&self.goal, pose),
+            ramp: self.limits.ramp(&self.goal, pose, speed),
         }
     }
 }

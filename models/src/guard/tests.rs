@@ -36,7 +36,15 @@ struct Bench {
     robot: Robot,
     guard: GoalGuard,
     measured: Vec<f32>,
+    wish: Wish,
+    period: Period,
 }
+
+/// A control period of emp27.
+const PERIOD: Period = Period {
+    elapsed: Duration::from_millis(20),
+    speed: 1.0,
+};
 
 impl Bench {
     fn new() -> Self {
@@ -44,6 +52,8 @@ impl Bench {
         Self {
             guard: GoalGuard::new(&robot, &SETTINGS),
             measured: pose(&robot, -0.1),
+            wish: Wish::Follow,
+            period: PERIOD,
             robot,
         }
     }
@@ -58,6 +68,8 @@ impl Bench {
             goal,
             age,
             measured: &self.measured,
+            wish: self.wish,
+            period: self.period,
         });
         (goal.to_vec(), phase)
     }
@@ -126,13 +138,16 @@ fn a_long_way_takes_longer() {
     let near = vec![0.0; robot.goal_joints().len()];
     let mut far = near.clone();
     far[1] = 3.0;
-    assert_eq!(limits.ramp(&near, &near).periods, RAMP as u32);
+    let seconds =
+        |from: &[f32], to: &[f32], speed| limits.ramp(from, to, speed).length.as_secs_f64();
+    assert_eq!(seconds(&near, &near, 1.0), 1.0);
     let joint = &robot.goal_joints()[1];
-    let seconds = f64::from(PEAK_SLOPE) * 3.0 / (f64::from(RAMP_SPEED) * joint.velocity_limit);
-    let periods = (seconds * robot.control_rate_hz()).ceil() as u32;
-    assert!(periods > RAMP as u32);
-    assert_eq!(limits.ramp(&near, &far).periods, periods);
-    assert_eq!(limits.ramp(&far, &near).periods, periods);
+    let expected = f64::from(PEAK_SLOPE) * 3.0 / (f64::from(RAMP_SPEED) * joint.velocity_limit);
+    assert!(expected > 1.0);
+    for (from, to) in [(&near, &far), (&far, &near)] {
+        assert!((seconds(from, to, 1.0) - expected).abs() < 1e-4);
+        assert!((seconds(from, to, 0.5) - 2.0 * expected).abs() < 1e-4);
+    }
 }
 
 #[test]
@@ -226,6 +241,89 @@ fn without_any_goal_the_robot_holds_its_pose_then_goes_home() {
 }
 
 #[test]
+fn a_ramp_takes_its_seconds_whatever_the_rate() {
+    for millis in [5, 20, 33] {
+        let mut bench = Bench::new();
+        bench.period.elapsed = Duration::from_millis(millis);
+        let mut periods = 0;
+        while bench.step(0.3, FRESH).1 != GoalPhase::Following {
+            periods += 1;
+        }
+        assert_eq!(periods, 1_000_u64.div_ceil(millis), "{millis} ms");
+    }
+}
+
+#[test]
+fn a_robot_that_was_silent_does_not_catch_up() {
+    let mut bench = Bench::new();
+    bench.step(0.3, FRESH);
+    bench.period.elapsed = Duration::from_secs(1);
+    let phase = bench.step(0.3, FRESH).1;
+    assert_eq!(phase, ramping(RampCause::FirstFrame, 0.04));
+}
+
+#[test]
+fn whoever_is_responsible_can_hold_a_robot_and_send_it_home() {
+    let mut bench = Bench::new();
+    bench.follow(0.3);
+    bench.wish = Wish::Hold;
+    let held = (pose(&bench.robot, 0.3), GoalPhase::Holding);
+    for age in [FRESH, LONG] {
+        assert_eq!(bench.step(-0.3, age), held);
+    }
+    bench.wish = Wish::Rest;
+    let home = GoalPhase::Returning { progress: 0.0 };
+    assert_eq!(bench.step(-0.3, FRESH), (held.0, home));
+    for _ in 0..2 * RAMP {
+        bench.step(-0.3, FRESH);
+    }
+    let resting = (default_pose(&bench.robot), GoalPhase::Resting);
+    assert_eq!(bench.step(-0.3, FRESH), resting);
+    bench.wish = Wish::Follow;
+    let back = bench.step(-0.3, FRESH).1;
+    assert_eq!(back, ramping(RampCause::OperatorReturned, 0.0));
+}
+
+#[test]
+fn frames_that_queued_let_no_more_time_pass_than_their_arrivals() {
+    let mut clock = RobotClock::new(&robot());
+    let ms = Duration::from_millis;
+    assert_eq!(clock.tick(ms(0), Some(ms(500))), ms(20));
+    // Jitter of the connection does not slow the robot down.
+    for (arrived, measured) in [(35, 520), (40, 540), (75, 560), (80, 580)] {
+        assert_eq!(clock.tick(ms(arrived), Some(ms(measured))), ms(20));
+    }
+    // A stall of 250 ms, then twelve frames at once.
+    let burst: Duration = (1..=12)
+        .map(|n| clock.tick(ms(330), Some(ms(580 + 20 * n))))
+        .sum();
+    assert_eq!(burst, ms(40));
+    // The same state again, and a clock that goes back.
+    assert_eq!(clock.tick(ms(350), Some(ms(820))), ms(0));
+    assert_eq!(clock.tick(ms(370), Some(ms(100))), ms(0));
+}
+
+#[test]
+fn without_the_robots_clock_the_arrivals_count() {
+    let mut clock = RobotClock::new(&robot());
+    let ms = Duration::from_millis;
+    clock.tick(ms(0), None);
+    assert_eq!(clock.tick(ms(5), None), ms(5));
+    assert_eq!(clock.tick(ms(255), None), ms(40));
+    assert_eq!(clock.tick(ms(255), None), ms(0));
+}
+
+#[test]
+fn a_correction_that_is_no_number_does_not_move_the_robot() {
+    let (robot, mut guard) = execution();
+    let start = default_pose(&robot);
+    guard.step(&start, &start, &mut start.clone());
+    let mut goal = vec![f32::NAN; start.len()];
+    guard.step(&start, &start, &mut goal);
+    assert!(goal.iter().all(|angle| angle.is_finite()));
+}
+
+#[test]
 fn a_measured_pose_outside_the_ranges_is_brought_inside() {
     let mut bench = Bench::new();
     let upper = bench.robot.goal_joints()[0].range[1] as f32;
@@ -308,6 +406,15 @@ fn a_jump_becomes_a_walk_at_the_joints_largest_speed() {
         periods += 1;
     }
     assert_eq!(periods, (1.0 / step) as usize);
+    let mut slow = ExecutionGuard::new(&robot, &SETTINGS);
+    for (millis, speed) in [(20, 0.25), (5, 1.0)] {
+        slow.restart();
+        let elapsed = Duration::from_millis(millis);
+        slow.set_period(Period { elapsed, speed });
+        let mut goal = asked.clone();
+        slow.step(&start, &asked, &mut goal);
+        assert!((goal[1] - (start[1] - step / 4.0)).abs() < TOLERANCE);
+    }
 }
 
 #[test]
@@ -379,14 +486,14 @@ proptest! {
                 }
             }
             for _ in 0..7 {
-                let input = GoalInput { goal: Some(&newest), age, measured: &measured };
+                let input = GoalInput { goal: Some(&newest), age, measured: &measured, wish: Wish::Follow, period: PERIOD };
                 let asked = before.step(&input).0.to_vec();
                 let mut goal: Vec<f32> = asked.iter().map(|angle| angle + correction).collect();
                 after.step(&measured, &asked, &mut goal);
                 for (joint, angle) in goal.iter().enumerate() {
                     let [lower, upper] = limits.ranges[joint];
                     prop_assert!((lower..=upper).contains(angle));
-                    prop_assert!((angle - measured[joint]).abs() <= limits.steps[joint] + TOLERANCE);
+                    prop_assert!((angle - measured[joint]).abs() <= 0.02 * limits.speeds[joint] + TOLERANCE);
                 }
                 measured = goal;
             }
@@ -403,11 +510,11 @@ proptest! {
         let mut last = start.clone();
         let mut periods = 0;
         loop {
-            let input = GoalInput { goal: Some(&end), age: FRESH, measured: &start };
+            let input = GoalInput { goal: Some(&end), age: FRESH, measured: &start, wish: Wish::Follow, period: PERIOD };
             let (goal, phase) = guard.step(&input);
             for (joint, angle) in goal.iter().enumerate() {
                 let step = (angle - last[joint]).abs();
-                prop_assert!(step <= RAMP_SPEED * limits.steps[joint] + TOLERANCE);
+                prop_assert!(step <= RAMP_SPEED * 0.02 * limits.speeds[joint] + TOLERANCE);
                 prop_assert!(periods > 0 || step == 0.0);
             }
             last = goal.to_vec();

@@ -82,18 +82,21 @@ pub fn medley_with_starts(seed: u64) -> (Clip, Vec<usize>) {
 /// A varied set of clips: two thirds go through the skills in turn, one third are random reaches.
 #[must_use]
 pub fn library(seed: u64, clips: usize) -> Vec<Clip> {
+    endless(seed).take(clips).collect()
+}
+
+/// The clips of a [`library`] of any size, made one by one.
+pub fn endless(seed: u64) -> impl Iterator<Item = Clip> {
     let mut seeds = ChaCha8Rng::seed_from_u64(seed);
     let mut skills = Skill::ALL.into_iter().cycle();
-    (0..clips)
-        .map(|index| {
-            let skill = if index % 3 == 2 {
-                Some(Skill::RandomReaches)
-            } else {
-                skills.next()
-            };
-            generate(skill.unwrap_or(Skill::RandomReaches), seeds.random())
-        })
-        .collect()
+    (0_usize..).map(move |index| {
+        let skill = if index % 3 == 2 {
+            Some(Skill::RandomReaches)
+        } else {
+            skills.next()
+        };
+        generate(skill.unwrap_or(Skill::RandomReaches), seeds.random())
+    })
 }
 
 /// Performs a skill from the timeline's current pose, drawing again until arms and trunk keep clear of each other.

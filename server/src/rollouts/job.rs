@@ -12,87 +12,54 @@ use std::{
 
 use emp_sim::{Pool, Priority, SimError};
 use thread_priority::{ThreadPriority, set_current_thread_priority};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::mpsc::{self, error::TrySendError};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-use crate::{deadline, error::ServiceError, settings::RolloutSettings};
+use super::jobs::JobPermit;
+use crate::error::ServiceError;
+use crate::inference::due;
 
 /// Messages that wait for a slow reader before its job stops.
 const OUTBOUND: usize = 16;
-/// When to ask again for a place; jobs are long.
-const RETRY: Duration = Duration::from_secs(5);
-
-/// Places for jobs, and the threads that each may use.
-pub(crate) struct Jobs {
-    places: Arc<Semaphore>,
-    threads: usize,
-}
-
-/// A job's place, free again when it is dropped.
-pub(crate) struct Place {
-    _permit: OwnedSemaphorePermit,
-    threads: usize,
-}
-
-impl Jobs {
-    pub(crate) fn new(settings: &RolloutSettings) -> Self {
-        let places = settings.max_jobs.get().min(Semaphore::MAX_PERMITS);
-        let cores = thread::available_parallelism().map_or(1, usize::from);
-        Self {
-            places: Arc::new(Semaphore::new(places)),
-            threads: match settings.threads {
-                0 => cores,
-                threads => threads,
-            },
-        }
-    }
-
-    /// A place, if one is free.
-    pub(crate) fn enter(&self) -> Result<Place, ServiceError> {
-        let permit =
-            Arc::clone(&self.places)
-                .try_acquire_owned()
-                .map_err(|_| ServiceError::Overloaded {
-                    what: "as many rollout jobs run as the server allows",
-                    retry: RETRY,
-                })?;
-        Ok(Place {
-            _permit: permit,
-            threads: self.threads,
-        })
-    }
-}
+/// How long a client may take no message before its job is given up.
+const READ_PATIENCE: Duration = Duration::from_secs(30);
+/// How often a job that waits for its client asks whether it has to stop.
+const GLANCE: Duration = Duration::from_millis(20);
 
 /// The way from a job to its client. Its clones end up in the call's task and on the job's thread.
-pub(crate) struct Line<T> {
+pub(crate) struct JobStream<T> {
     sender: mpsc::Sender<Result<T, Status>>,
     drain: CancellationToken,
+    /// Cancelled when somebody cancels the job.
+    cancelled: CancellationToken,
     deadline: Option<Instant>,
 }
 
-impl<T> Clone for Line<T> {
+impl<T> Clone for JobStream<T> {
     fn clone(&self) -> Self {
         Self {
             sender: self.sender.clone(),
             drain: self.drain.clone(),
+            cancelled: self.cancelled.clone(),
             deadline: self.deadline,
         }
     }
 }
 
-impl<T: Send + 'static> Line<T> {
+impl<T: Send + 'static> JobStream<T> {
     pub(crate) fn new(
         drain: CancellationToken,
         deadline: Option<Instant>,
     ) -> (Self, mpsc::Receiver<Result<T, Status>>) {
         let (sender, receiver) = mpsc::channel(OUTBOUND);
-        let line = Self {
+        let stream = Self {
             sender,
             drain,
+            cancelled: CancellationToken::new(),
             deadline,
         };
-        (line, receiver)
+        (stream, receiver)
     }
 
     /// Why the job has to stop, if it has to. Cheap: to be asked once a control period.
@@ -101,16 +68,36 @@ impl<T: Send + 'static> Line<T> {
             Err(gone())
         } else if self.drain.is_cancelled() {
             Err(ServiceError::ShuttingDown)
-        } else if deadline::has_passed(self.deadline) {
+        } else if self.cancelled.is_cancelled() {
+            Err(ServiceError::JobCancelled)
+        } else if due::has_passed(self.deadline) {
             Err(ServiceError::DeadlineExceeded)
         } else {
             Ok(())
         }
     }
 
-    /// Sends a message from the job's thread; waits for a slow reader.
+    /// Cancelled to stop the job.
+    pub(crate) fn cancellation(&self) -> &CancellationToken {
+        &self.cancelled
+    }
+
+    /// Sends a message from the job's thread; waits a while for a slow reader, unless the job has to stop.
     pub(crate) fn send(&self, message: T) -> Result<(), ServiceError> {
-        self.sender.blocking_send(Ok(message)).map_err(|_| gone())
+        let mut message = Ok(message);
+        let start = Instant::now();
+        loop {
+            match self.sender.try_send(message) {
+                Ok(()) => return Ok(()),
+                Err(TrySendError::Closed(_)) => return Err(gone()),
+                Err(TrySendError::Full(back)) => message = back,
+            }
+            self.check()?;
+            if start.elapsed() > READ_PATIENCE {
+                return Err(ServiceError::Silent("the client reads too slowly"));
+            }
+            thread::sleep(GLANCE);
+        }
     }
 
     /// Resolves when the job has to stop, with the reason.
@@ -118,7 +105,8 @@ impl<T: Send + 'static> Line<T> {
         tokio::select! {
             () = self.sender.closed() => gone(),
             () = self.drain.cancelled() => ServiceError::ShuttingDown,
-            () = deadline::passed(self.deadline) => ServiceError::DeadlineExceeded,
+            () = self.cancelled.cancelled() => ServiceError::JobCancelled,
+            () = due::passed(self.deadline) => ServiceError::DeadlineExceeded,
         }
     }
 
@@ -146,38 +134,62 @@ impl<T: Send + 'static> Line<T> {
     /// or a panic is the call's end.
     pub(crate) fn start(
         self,
-        place: Place,
+        place: JobPermit,
         work: impl FnOnce(&Self, usize) -> Result<(), ServiceError> + Send + 'static,
     ) {
-        let span = tracing::Span::current();
         let reply = self.sender.clone();
-        let job = move || {
-            let _entered = span.enter();
-            // Where the system refuses, the job runs on with the usual priority.
-            let _ = set_current_thread_priority(ThreadPriority::Min);
-            let started = Instant::now();
-            let worked = catch_unwind(AssertUnwindSafe(|| work(&self, place.threads)));
-            let end = worked.unwrap_or_else(|panic| Err(panicked(&*panic)));
-            let seconds = started.elapsed().as_secs_f64();
-            // The place is free before the client hears of the end and asks for the next.
-            drop(place);
-            match end {
-                Ok(()) => tracing::info!(seconds, "job done"),
-                Err(error) => {
-                    tracing::info!(seconds, %error, "job ended early");
-                    let _ = self.sender.blocking_send(Err(error.into()));
+        let started = start(place, move |threads| {
+            let worked = guarded(|| work(&self, threads));
+            move || {
+                if let Err(error) = worked {
+                    // A client that does not read is not waited for.
+                    let _ = self.sender.try_send(Err(error.into()));
                 }
             }
-        };
-        if let Err(error) = thread::Builder::new()
-            .name("rollout job".to_owned())
-            .spawn(job)
-        {
-            let error = ServiceError::JobFailed(format!("no thread for it: {error}"));
+        });
+        if let Err(error) = started {
             // The channel is new and has room.
             let _ = reply.try_send(Err(error.into()));
         }
     }
+}
+
+/// Runs `work` on a thread of its own with the lowest priority, gives its place back, and then runs what it answers: so the place is
+/// free before anybody hears of the end and asks for the next.
+pub(super) fn start<A: FnOnce()>(
+    place: JobPermit,
+    work: impl FnOnce(usize) -> A + Send + 'static,
+) -> Result<(), ServiceError> {
+    let span = tracing::Span::current();
+    let job = move || {
+        let _entered = span.enter();
+        // Where the system refuses, the job runs on with the usual priority.
+        let _ = set_current_thread_priority(ThreadPriority::Min);
+        let started = Instant::now();
+        let afterwards = work(place.threads);
+        drop(place);
+        tracing::info!(seconds = started.elapsed().as_secs_f64(), "job ended");
+        afterwards();
+    };
+    let spawned = thread::Builder::new()
+        .name("rollout job".to_owned())
+        .spawn(job);
+    match spawned {
+        Ok(_) => Ok(()),
+        Err(error) => Err(ServiceError::JobFailed(format!(
+            "no thread for it: {error}"
+        ))),
+    }
+}
+
+/// Runs a job's work; a panic becomes an error.
+pub(super) fn guarded(work: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), ServiceError> {
+    let worked = catch_unwind(AssertUnwindSafe(work));
+    let end = worked.unwrap_or_else(|panic| Err(panicked(&*panic)));
+    if let Err(error) = &end {
+        tracing::info!(%error, "job ended early");
+    }
+    end
 }
 
 fn gone() -> ServiceError {

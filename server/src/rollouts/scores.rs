@@ -9,15 +9,13 @@ use emp_sim::{
     metrics::Interval,
 };
 
-use crate::wire;
+use crate::encode;
 
-pub(super) fn result(evaluation: &Evaluation, robot: &Robot) -> v1::EvaluationResult {
-    let failed = evaluation.results.iter().filter(|e| e.failure.is_some());
+pub(super) fn result(evaluation: &Evaluation) -> v1::EvaluationResult {
     v1::EvaluationResult {
         all: Some(metrics(&evaluation.all)),
         recorded: evaluation.recorded.as_ref().map(metrics),
         procedural: evaluation.procedural.as_ref().map(metrics),
-        failures: failed.map(|failure| episode(failure, robot)).collect(),
     }
 }
 
@@ -34,12 +32,12 @@ pub(super) fn episode(result: &EpisodeResult, robot: &Robot) -> v1::EpisodeResul
     let failed_after = |_| result.frames as f64 / robot.control_rate_hz();
     let means = result.sums.means();
     v1::EpisodeResult {
-        episode: wire::count(result.episode),
+        episode: encode::count(result.episode),
         clip: result.clip.clone(),
         source: source.into(),
-        frames: wire::count(result.frames),
+        frames: encode::count(result.frames),
         end: end.into(),
-        failure_time: result.failure.map_or(0.0, failed_after),
+        failure_time: result.failure.map(failed_after),
         reason: result
             .failure
             .map_or_else(String::new, |reason| reason.to_string()),
@@ -63,7 +61,7 @@ fn metrics(scores: &Scores) -> v1::EvaluationMetrics {
     let metric = |Interval { mean, low, high }| Some(v1::Metric { mean, low, high });
     let metrics = scores.metrics;
     v1::EvaluationMetrics {
-        episodes: wire::count(scores.episodes),
+        episodes: encode::count(scores.episodes),
         suc: metric(metrics.suc),
         mjp: metric(metrics.mjp),
         msc: metric(metrics.msc),

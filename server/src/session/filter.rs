@@ -5,20 +5,22 @@ use std::sync::Arc;
 
 use emp_models::controller::ControllerState;
 use emp_proto::v1::{
-    DroppedFrame, FilterFrame, FilteredFrame, FrameHeader, StreamFilterGoalConfig,
-    StreamFilterGoalRequest, StreamFilterGoalResponse, StreamFilterStarted,
-    stream_filter_goal_request::Message as Request,
+    DroppedFrame, FilterGoalFrame, FilteredGoalFrame, FrameHeader, GoingAway,
+    StreamFilterGoalConfig, StreamFilterGoalRequest, StreamFilterGoalResponse,
+    StreamFilterGoalStarted, stream_filter_goal_request::Message as Request,
     stream_filter_goal_response::Message as Response,
 };
 
-use super::{Incoming, Kind};
+use super::{Codec, Incoming, Memory};
+use emp_robot::Robot;
+
 use crate::{
     catalog::{Catalog, FilterModel},
-    control::{ControlInput, EmpMode, FilterOutput, Filters},
+    decode::robot_state::{self, ControlPeriod},
+    encode,
     error::{FieldError, ServiceError},
-    queue::Answer,
-    robot_state::{self, ControlPeriod},
-    wire,
+    inference::controllers::{ControlInput, EmpMode, FilterOutput, Filters},
+    inference::queue::Answer,
 };
 
 /// What a stream of goals remembers.
@@ -27,15 +29,12 @@ pub(crate) struct FilterStream {
     mode: EmpMode,
     /// The past as far as it was answered.
     past: ControllerState,
-    /// A frame that was to start an episode has arrived; the next good one does.
-    must_reset: bool,
 }
 
-/// A control period, the action that led to it, and whether it starts an episode.
+/// A control period, and the action that led to it.
 pub(crate) struct Frame {
     period: ControlPeriod,
     last_action: Vec<f32>,
-    reset: bool,
 }
 
 fn response(message: Response) -> StreamFilterGoalResponse {
@@ -44,15 +43,17 @@ fn response(message: Response) -> StreamFilterGoalResponse {
     }
 }
 
-impl Kind for FilterStream {
+impl Codec for FilterStream {
     type Request = StreamFilterGoalRequest;
     type Response = StreamFilterGoalResponse;
     type Config = StreamFilterGoalConfig;
-    type WireFrame = FilterFrame;
+    type WireFrame = FilterGoalFrame;
     type Frame = Frame;
     type Input = ControlInput;
     type Output = FilterOutput;
     type Model = Filters;
+
+    const ENDS_AT_ONCE: bool = false;
 
     fn sort(request: StreamFilterGoalRequest) -> Option<Incoming<Self>> {
         Some(match request.message? {
@@ -65,70 +66,69 @@ impl Kind for FilterStream {
         response(Response::Dropped(notice))
     }
 
+    fn going_away(notice: GoingAway) -> StreamFilterGoalResponse {
+        response(Response::GoingAway(notice))
+    }
+
     fn delivery(config: &StreamFilterGoalConfig) -> i32 {
         config.delivery
     }
 
-    fn model<'a>(
-        catalog: &'a Catalog,
+    fn model(
+        catalog: &Catalog,
         config: &StreamFilterGoalConfig,
-    ) -> Result<&'a Arc<FilterModel>, ServiceError> {
+    ) -> Result<Arc<FilterModel>, ServiceError> {
         catalog.filter_for(&config.robot, &config.model, &config.model_version)
     }
 
+    fn header(frame: &FilterGoalFrame) -> Option<FrameHeader> {
+        frame.header
+    }
+
+    fn resets(frame: &FilterGoalFrame) -> bool {
+        frame.reset
+    }
+
+    fn read(robot: &Robot, frame: FilterGoalFrame) -> Result<Frame, FieldError> {
+        let period = ControlPeriod::read("", frame.state.as_ref(), &frame.goal, robot)?;
+        let last_action = robot_state::read_last_action("last_action", &frame.last_action, robot)?;
+        Ok(Frame {
+            period,
+            last_action,
+        })
+    }
+}
+
+impl Memory for FilterStream {
     fn open(config: &StreamFilterGoalConfig, model: &Arc<FilterModel>) -> Result<Self, FieldError> {
-        let mode = robot_state::read_mode("config.emp_mode", config.emp_mode, EmpMode::On, true)?;
+        let mode = robot_state::read_mode("config.emp_mode", config.emp_mode, true)?;
         Ok(Self {
             model: Arc::clone(model),
             mode,
             past: model.model.state(),
-            must_reset: false,
         })
     }
 
     fn started(&self) -> StreamFilterGoalResponse {
         let FilterModel { card, robot, .. } = &*self.model;
-        response(Response::Started(StreamFilterStarted {
+        response(Response::Started(StreamFilterGoalStarted {
             robot: card.robot.clone(),
             model: card.name.clone(),
             model_version: card.version.clone(),
-            goal_joint_names: wire::joint_names(robot.goal_joints()),
-            leg_joint_names: wire::joint_names(robot.leg_joints()),
-            history: wire::count(self.model.model.layout().history()),
+            goal_joint_names: encode::joint_names(robot.goal_joints()),
+            leg_joint_names: encode::joint_names(robot.leg_joints()),
+            history: encode::count(self.model.model.layout().history()),
         }))
     }
 
-    fn header(frame: &FilterFrame) -> Option<FrameHeader> {
-        frame.header
+    fn reset(&mut self) {
+        self.past.reset();
     }
 
-    fn arrived(&mut self, frame: &FilterFrame) {
-        self.must_reset |= frame.reset;
-    }
-
-    fn read(&mut self, frame: FilterFrame) -> Result<Frame, FieldError> {
-        let robot = &self.model.robot;
-        let period = ControlPeriod::read("", frame.state.as_ref(), &frame.goal, robot)?;
-        let last_action = robot_state::read_last_action("last_action", &frame.last_action, robot)?;
-        let reset = std::mem::take(&mut self.must_reset);
-        Ok(Frame {
-            period,
-            last_action,
-            reset,
-        })
-    }
-
-    fn supersede(old: &Frame, new: &mut Frame) {
-        new.reset |= old.reset;
-    }
-
-    fn input(&mut self, frame: &Frame) -> ControlInput {
-        if frame.reset {
-            self.past.reset();
-        }
+    fn input(&self, frame: Frame) -> ControlInput {
         let mut past = self.past.clone();
         past.history_mut().set_last_action(&frame.last_action);
-        frame.period.clone().after(past, self.mode)
+        frame.period.after(past, self.mode)
     }
 
     fn answer(
@@ -136,16 +136,15 @@ impl Kind for FilterStream {
         header: Option<FrameHeader>,
         answer: Answer<FilterOutput>,
     ) -> StreamFilterGoalResponse {
-        let timing = wire::timing(&answer);
+        let timing = encode::timing(&answer);
         let FilterOutput {
             state,
             filtered,
             assessment,
         } = answer.output;
         self.past = state;
-        let robot = &self.model.robot;
-        let result = wire::filter_result(robot, filtered.goal, filtered.risk, assessment);
-        response(Response::Result(FilteredFrame {
+        let result = encode::filter_result(filtered.goal, filtered.risk, assessment);
+        response(Response::Result(FilteredGoalFrame {
             header,
             result: Some(result),
             timing: Some(timing),

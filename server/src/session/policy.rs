@@ -4,19 +4,21 @@ use std::sync::Arc;
 
 use emp_models::controller::ControllerState;
 use emp_proto::v1::{
-    DroppedFrame, FrameHeader, PolicyFrame, SteppedFrame, StreamPolicyConfig, StreamPolicyRequest,
-    StreamPolicyResponse, StreamPolicyStarted, stream_policy_request::Message as Request,
-    stream_policy_response::Message as Response,
+    DroppedFrame, FrameHeader, GoingAway, PolicyFrame, SteppedFrame, StreamPolicyConfig,
+    StreamPolicyRequest, StreamPolicyResponse, StreamPolicyStarted,
+    stream_policy_request::Message as Request, stream_policy_response::Message as Response,
 };
 
-use super::{Incoming, Kind};
+use super::{Codec, Incoming, Memory};
+use emp_robot::Robot;
+
 use crate::{
     catalog::{Catalog, PolicyModel},
-    control::{ControlInput, Controllers, EmpMode, PolicyOutput},
+    decode::robot_state::{self, ControlPeriod},
+    encode,
     error::{FieldError, ServiceError},
-    queue::Answer,
-    robot_state::{self, ControlPeriod},
-    wire,
+    inference::controllers::{ControlInput, Controllers, EmpMode, PolicyOutput},
+    inference::queue::Answer,
 };
 
 /// What a stream of robot states remembers.
@@ -25,14 +27,6 @@ pub(crate) struct PolicyStream {
     mode: EmpMode,
     /// The past as far as it was answered.
     past: ControllerState,
-    /// A frame that was to start an episode has arrived; the next good one does.
-    must_reset: bool,
-}
-
-/// A control period, and whether it starts an episode.
-pub(crate) struct Frame {
-    period: ControlPeriod,
-    reset: bool,
 }
 
 fn response(message: Response) -> StreamPolicyResponse {
@@ -41,15 +35,17 @@ fn response(message: Response) -> StreamPolicyResponse {
     }
 }
 
-impl Kind for PolicyStream {
+impl Codec for PolicyStream {
     type Request = StreamPolicyRequest;
     type Response = StreamPolicyResponse;
     type Config = StreamPolicyConfig;
     type WireFrame = PolicyFrame;
-    type Frame = Frame;
+    type Frame = ControlPeriod;
     type Input = ControlInput;
     type Output = PolicyOutput;
     type Model = Controllers;
+
+    const ENDS_AT_ONCE: bool = false;
 
     fn sort(request: StreamPolicyRequest) -> Option<Incoming<Self>> {
         Some(match request.message? {
@@ -62,26 +58,42 @@ impl Kind for PolicyStream {
         response(Response::Dropped(notice))
     }
 
+    fn going_away(notice: GoingAway) -> StreamPolicyResponse {
+        response(Response::GoingAway(notice))
+    }
+
     fn delivery(config: &StreamPolicyConfig) -> i32 {
         config.delivery
     }
 
-    fn model<'a>(
-        catalog: &'a Catalog,
+    fn model(
+        catalog: &Catalog,
         config: &StreamPolicyConfig,
-    ) -> Result<&'a Arc<PolicyModel>, ServiceError> {
+    ) -> Result<Arc<PolicyModel>, ServiceError> {
         catalog.policy_for(&config.robot, &config.model, &config.model_version)
     }
 
+    fn header(frame: &PolicyFrame) -> Option<FrameHeader> {
+        frame.header
+    }
+
+    fn resets(frame: &PolicyFrame) -> bool {
+        frame.reset
+    }
+
+    fn read(robot: &Robot, frame: PolicyFrame) -> Result<ControlPeriod, FieldError> {
+        ControlPeriod::read("", frame.state.as_ref(), &frame.goal, robot)
+    }
+}
+
+impl Memory for PolicyStream {
     fn open(config: &StreamPolicyConfig, model: &Arc<PolicyModel>) -> Result<Self, FieldError> {
         let has_emp = model.model.emp().is_some();
-        let mode =
-            robot_state::read_mode("config.emp_mode", config.emp_mode, EmpMode::Off, has_emp)?;
+        let mode = robot_state::read_mode("config.emp_mode", config.emp_mode, has_emp)?;
         Ok(Self {
             model: Arc::clone(model),
             mode,
             past: model.model.state(),
-            must_reset: false,
         })
     }
 
@@ -92,35 +104,18 @@ impl Kind for PolicyStream {
             robot: card.robot.clone(),
             model: card.name.clone(),
             model_version: card.version.clone(),
-            goal_joint_names: wire::joint_names(robot.goal_joints()),
-            leg_joint_names: wire::joint_names(robot.leg_joints()),
-            history: wire::count(history),
+            goal_joint_names: encode::joint_names(robot.goal_joints()),
+            leg_joint_names: encode::joint_names(robot.leg_joints()),
+            history: encode::count(history),
         }))
     }
 
-    fn header(frame: &PolicyFrame) -> Option<FrameHeader> {
-        frame.header
+    fn reset(&mut self) {
+        self.past.reset();
     }
 
-    fn arrived(&mut self, frame: &PolicyFrame) {
-        self.must_reset |= frame.reset;
-    }
-
-    fn read(&mut self, frame: PolicyFrame) -> Result<Frame, FieldError> {
-        let period = ControlPeriod::read("", frame.state.as_ref(), &frame.goal, &self.model.robot)?;
-        let reset = std::mem::take(&mut self.must_reset);
-        Ok(Frame { period, reset })
-    }
-
-    fn supersede(old: &Frame, new: &mut Frame) {
-        new.reset |= old.reset;
-    }
-
-    fn input(&mut self, frame: &Frame) -> ControlInput {
-        if frame.reset {
-            self.past.reset();
-        }
-        frame.period.clone().after(self.past.clone(), self.mode)
+    fn input(&self, period: ControlPeriod) -> ControlInput {
+        period.after(self.past.clone(), self.mode)
     }
 
     fn answer(
@@ -128,14 +123,14 @@ impl Kind for PolicyStream {
         header: Option<FrameHeader>,
         answer: Answer<PolicyOutput>,
     ) -> StreamPolicyResponse {
-        let timing = wire::timing(&answer);
+        let timing = encode::timing(&answer);
         let PolicyOutput {
             state,
             output,
             assessment,
         } = answer.output;
         self.past = state;
-        let result = wire::policy_result(&self.model.robot, self.mode, output, assessment);
+        let result = encode::policy_result(self.mode, output, assessment);
         response(Response::Result(SteppedFrame {
             header,
             result: Some(result),

@@ -2,21 +2,25 @@
 
 use std::sync::Arc;
 
-use emp_models::retarget::{Memory, Mode, RetargetInput, RetargetOutput, Retargeter, Smoother};
+use emp_models::retarget::{
+    Memory as Previous, Mode, RetargetInput, RetargetOutput, Retargeter, Smoother,
+};
 use emp_motion::KeyNodeFrame;
 use emp_proto::v1::{
-    DroppedFrame, FrameHeader, RetargetFrame, RetargetedFrame, StreamRetargetConfig,
-    StreamRetargetRequest, StreamRetargetResponse, StreamStarted,
+    DroppedFrame, FrameHeader, GoingAway, RetargetFrame, RetargetedFrame, StreamRetargetConfig,
+    StreamRetargetRequest, StreamRetargetResponse, StreamRetargetStarted,
     stream_retarget_request::Message as Request, stream_retarget_response::Message as Response,
 };
 
-use super::{Incoming, Kind};
+use super::{Codec, Incoming, Memory};
+use emp_robot::Robot;
+
 use crate::{
     catalog::{Catalog, RetargetModel},
+    decode::pose,
+    encode,
     error::{FieldError, ServiceError},
-    pose,
-    queue::Answer,
-    wire,
+    inference::queue::Answer,
 };
 
 /// What a stream of poses remembers.
@@ -25,7 +29,7 @@ pub(crate) struct RetargetStream {
     refine: bool,
     smoother: Option<Smoother>,
     /// What the next refined answer starts from.
-    memory: Option<Box<Memory>>,
+    previous: Option<Box<Previous>>,
 }
 
 fn response(message: Response) -> StreamRetargetResponse {
@@ -34,7 +38,7 @@ fn response(message: Response) -> StreamRetargetResponse {
     }
 }
 
-impl Kind for RetargetStream {
+impl Codec for RetargetStream {
     type Request = StreamRetargetRequest;
     type Response = StreamRetargetResponse;
     type Config = StreamRetargetConfig;
@@ -43,6 +47,8 @@ impl Kind for RetargetStream {
     type Input = RetargetInput;
     type Output = RetargetOutput;
     type Model = Option<Arc<Retargeter>>;
+
+    const ENDS_AT_ONCE: bool = true;
 
     fn sort(request: StreamRetargetRequest) -> Option<Incoming<Self>> {
         Some(match request.message? {
@@ -55,29 +61,43 @@ impl Kind for RetargetStream {
         response(Response::Dropped(notice))
     }
 
+    fn going_away(notice: GoingAway) -> StreamRetargetResponse {
+        response(Response::GoingAway(notice))
+    }
+
     fn delivery(config: &StreamRetargetConfig) -> i32 {
         config.delivery
     }
 
-    fn model<'a>(
-        catalog: &'a Catalog,
+    fn model(
+        catalog: &Catalog,
         config: &StreamRetargetConfig,
-    ) -> Result<&'a Arc<RetargetModel>, ServiceError> {
+    ) -> Result<Arc<RetargetModel>, ServiceError> {
         catalog.retargeter_for(&config.robot, &config.model, &config.model_version)
     }
 
+    fn header(frame: &RetargetFrame) -> Option<FrameHeader> {
+        frame.header
+    }
+
+    fn read(_: &Robot, frame: RetargetFrame) -> Result<KeyNodeFrame, FieldError> {
+        pose::read(frame.pose.as_ref())
+    }
+}
+
+impl Memory for RetargetStream {
     fn open(config: &StreamRetargetConfig, model: &Arc<RetargetModel>) -> Result<Self, FieldError> {
         Ok(Self {
             model: Arc::clone(model),
             refine: config.refine,
             smoother: config.smoothing.then(Smoother::new),
-            memory: None,
+            previous: None,
         })
     }
 
     fn started(&self) -> StreamRetargetResponse {
         let card = &self.model.card;
-        response(Response::Started(StreamStarted {
+        response(Response::Started(StreamRetargetStarted {
             robot: card.robot.clone(),
             model: card.name.clone(),
             model_version: card.version.clone(),
@@ -85,18 +105,10 @@ impl Kind for RetargetStream {
         }))
     }
 
-    fn header(frame: &RetargetFrame) -> Option<FrameHeader> {
-        frame.header
-    }
-
-    fn read(&mut self, frame: RetargetFrame) -> Result<KeyNodeFrame, FieldError> {
-        pose::read(frame.pose.as_ref())
-    }
-
-    fn input(&mut self, frame: &KeyNodeFrame) -> RetargetInput {
+    fn input(&self, frame: KeyNodeFrame) -> RetargetInput {
         RetargetInput {
-            frame: frame.clone(),
-            mode: match &self.memory {
+            frame,
+            mode: match &self.previous {
                 _ if !self.refine => Mode::Network,
                 None => Mode::Begin,
                 Some(memory) => Mode::Follow {
@@ -112,14 +124,14 @@ impl Kind for RetargetStream {
         header: Option<FrameHeader>,
         answer: Answer<RetargetOutput>,
     ) -> StreamRetargetResponse {
-        let timing = wire::timing(&answer);
+        let timing = encode::timing(&answer);
         let mut angles = answer.output.angles;
-        self.memory = answer.output.memory;
+        self.previous = answer.output.memory;
         if let Some(smoother) = &mut self.smoother {
             smoother.step(&mut angles);
         }
         let result =
-            wire::retarget_result(&self.model.robot, angles, answer.output.direction_error);
+            encode::retarget_result(&self.model.robot, angles, answer.output.direction_error);
         response(Response::Result(RetargetedFrame {
             header,
             result: Some(result),

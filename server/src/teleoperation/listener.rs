@@ -1,129 +1,172 @@
-//! Operators and observers: poses in, or nothing, and everything out that is told in the session.
+//! Operators and observers: an operator's frames in, and everything out that is told in the session.
 
 use std::{collections::VecDeque, time::Instant};
 
-use emp_proto::v1::{
-    TeleoperateRequest, TeleoperateResponse, TeleoperatedFrame, TeleoperationFrame,
-};
+use emp_proto::v1::{TeleoperateRequest, teleoperate_request::Message as Request};
 use tokio::sync::broadcast::{self, error::RecvError};
-use tonic::Streaming;
 
-use super::{Joined, Outbound, Role, frame_of, messages, sessions::Told};
+use super::{
+    joined::{Joined, LossCounter},
+    messages::Notice,
+    operator::{Operator, Taken},
+    sessions::SessionEvent,
+};
 use crate::{
-    deadline,
+    dropped::NotComputed,
     error::{FieldError, ServiceError},
-    pose,
-    session::{NotComputed, SessionContext},
+    session::{Outbound, Reader, StreamContext},
 };
 
 /// Serves the stream of an operator or an observer after it was accepted.
 ///
 /// An operator who half-closes leaves. An observer has nothing to send, and goes on listening.
-pub(super) async fn run(
-    context: &SessionContext,
+pub(super) async fn run<R: From<Notice>>(
+    context: &StreamContext,
     joined: &Joined,
-    mut told: broadcast::Receiver<Told>,
-    mut inbound: Streaming<TeleoperateRequest>,
-    outbound: &Outbound,
+    told: broadcast::Receiver<SessionEvent>,
+    inbound: Option<Reader<TeleoperateRequest>>,
+    outbound: &Outbound<R>,
 ) -> Result<(), ServiceError> {
-    let mut listener = Listener {
+    let retargeting = joined.retargeting.as_deref();
+    let operator = retargeting.map(|retargeting| Operator::new(joined, retargeting));
+    let listener = Listener {
         joined,
+        operator: operator.as_ref(),
         outbox: VecDeque::new(),
-        missed: 0,
+        taken: Taken::default(),
+        lost: LossCounter::default(),
+        next: joined.member.periods(),
     };
-    let mut reading = true;
-    loop {
-        let has_room = listener.outbox.len() < context.buffer;
-        tokio::select! {
-            permit = outbound.reserve(), if !listener.outbox.is_empty() => match permit {
-                Ok(permit) => {
-                    if let Some(message) = listener.outbox.pop_front() {
-                        permit.send(Ok(message));
-                    }
-                }
-                Err(_) => return Ok(()),
-            },
-            message = inbound.message(), if reading && has_room => {
-                match message.map_err(ServiceError::Transport)? {
-                    Some(message) => listener.accept(&frame_of(message)?),
-                    None if joined.member.role() == Role::Operator => break,
-                    None => reading = false,
-                }
-            }
-            // What is told waits in the channel, which forgets what a slow reader leaves there for long.
-            news = told.recv(), if listener.outbox.is_empty() => match news {
-                Ok(told) => listener.pass_on(told),
-                Err(RecvError::Lagged(missed)) => listener.catch_up(missed),
-                Err(RecvError::Closed) => break,
-            },
-            () = context.drain.cancelled() => return Err(ServiceError::ShuttingDown),
-        }
+    let listening = async {
+        let end = listener.run(context, told, inbound, outbound).await;
+        operator.as_ref().inspect(|operator| operator.close());
+        end
+    };
+    match &operator {
+        Some(operator) => tokio::join!(listening, operator.retarget()).0,
+        None => listening.await,
     }
-    for message in listener.outbox {
-        if outbound.send(Ok(message)).await.is_err() {
-            break;
-        }
-    }
-    Ok(())
 }
 
 struct Listener<'a> {
     joined: &'a Joined,
-    outbox: VecDeque<TeleoperateResponse>,
-    /// Control periods that were not told since the last that was.
-    missed: u64,
+    operator: Option<&'a Operator<'a>>,
+    outbox: VecDeque<Notice>,
+    taken: Taken,
+    lost: LossCounter,
+    /// Number of the control period that is told next.
+    next: u64,
 }
 
 impl Listener<'_> {
-    fn accept(&mut self, frame: &TeleoperationFrame) {
-        let header = frame.header;
-        if let Err(error) = self.take_pose(frame) {
-            let notice = NotComputed::from(error).notice(header);
-            self.outbox.push_back(messages::dropped(notice));
+    async fn run<R: From<Notice>>(
+        mut self,
+        context: &StreamContext,
+        mut told: broadcast::Receiver<SessionEvent>,
+        mut inbound: Option<Reader<TeleoperateRequest>>,
+        outbound: &Outbound<R>,
+    ) -> Result<(), ServiceError> {
+        let drain = &context.drain;
+        let over = drain.over();
+        tokio::pin!(over);
+        let mut is_told = false;
+        loop {
+            let has_room = self.outbox.len() < context.buffer;
+            tokio::select! {
+                permit = outbound.reserve(), if !self.outbox.is_empty() => match permit {
+                    Ok(permit) => {
+                        if let Some(notice) = self.outbox.pop_front() {
+                            permit.send(notice.into());
+                        }
+                    }
+                    Err(_) => return Ok(()),
+                },
+                message = next(&mut inbound), if has_room => match message {
+                    Ok(Some(message)) => self.accept(message)?,
+                    Ok(None) if self.operator.is_some() => break,
+                    Ok(None) => inbound = None,
+                    // An observer is silent by trade.
+                    Err(ServiceError::Silent(_)) if self.operator.is_none() => {}
+                    Err(error) => return Err(error),
+                },
+                // What is told waits in the channel, which forgets what a slow reader leaves there for long.
+                news = told.recv(), if self.outbox.is_empty() => match news {
+                    Ok(event) => self.pass_on(event),
+                    Err(RecvError::Lagged(_)) => {}
+                    Err(RecvError::Closed) => break,
+                },
+                () = drain.begun.cancelled(), if !is_told => {
+                    is_told = true;
+                    self.outbox.push_back(Notice::GoingAway(drain.notice()));
+                }
+                () = &mut over => return Err(ServiceError::ShuttingDown),
+            }
+            // Without a robot there is nothing to wait for.
+            if is_told && self.outbox.is_empty() && !self.joined.member.presence().robot {
+                return Err(ServiceError::ShuttingDown);
+            }
         }
-    }
-
-    fn take_pose(&self, frame: &TeleoperationFrame) -> Result<(), FieldError> {
-        let member = &self.joined.member;
-        if member.role() == Role::Observer {
-            return Err(FieldError::new("frame", "an observer sends no frames"));
+        for notice in self.outbox {
+            if outbound.send(notice.into()).await.is_err() {
+                break;
+            }
         }
-        if frame.state.is_some() {
-            let description = "states come from the session's robot; expected a pose";
-            return Err(FieldError::new("state", description));
-        }
-        let arrived = Instant::now();
-        let deadline = deadline::of_frame(frame.header.as_ref(), arrived)?;
-        let mode = self.joined.mode_of(frame)?;
-        let pose = pose::read(frame.pose.as_ref())?;
-        if let Some(mode) = mode {
-            member.set_emp_mode(mode);
-        }
-        member.set_pose(
-            frame.header,
-            pose,
-            arrived,
-            deadline,
-            &self.joined.retargeting,
-        );
         Ok(())
     }
 
-    fn pass_on(&mut self, told: Told) {
-        let message = match told {
-            Told::Result(result) => messages::result(TeleoperatedFrame {
-                missed: std::mem::take(&mut self.missed),
-                ..TeleoperatedFrame::clone(&result)
-            }),
-            Told::Presence(presence) => messages::presence(presence),
+    fn accept(&mut self, request: TeleoperateRequest) -> Result<(), ServiceError> {
+        let (header, error) = match (request.message, self.operator) {
+            (Some(Request::Operator(frame)), Some(operator)) => {
+                let header = frame.header;
+                let lost = self.lost.count(header.as_ref());
+                self.joined.member.heard(lost);
+                let taken = operator.take(&frame, header, Instant::now(), &mut self.taken);
+                match taken {
+                    Ok(Some(pose)) => return operator.push(pose),
+                    Ok(None) => return Ok(()),
+                    Err(error) => (header, error),
+                }
+            }
+            (Some(Request::Config(_)), _) => return Err(FieldError::second_config().into()),
+            (None, _) => return Err(FieldError::missing_frame().into()),
+            (Some(frame), operator) => {
+                let (header, sent) = match frame {
+                    Request::Operator(frame) => (frame.header, "operator"),
+                    Request::Robot(frame) => (frame.header, "robot"),
+                    Request::Both(frame) => (frame.robot.and_then(|robot| robot.header), "both"),
+                    Request::Config(_) => (None, "config"),
+                };
+                let description = match operator {
+                    Some(_) => "this client is the session's operator; expected `operator`",
+                    None => "an observer sends no frames",
+                };
+                (header, FieldError::new(sent, description))
+            }
         };
-        self.outbox.push_back(message);
+        let notice = NotComputed::from(error).notice(header);
+        self.outbox.push_back(Notice::Dropped(notice));
+        Ok(())
     }
 
-    /// What was missed may have been about who is there.
-    fn catch_up(&mut self, missed: u64) {
-        self.missed += missed;
-        let presence = self.joined.member.presence();
-        self.outbox.push_back(messages::presence(presence));
+    fn pass_on(&mut self, event: SessionEvent) {
+        self.outbox.push_back(match event {
+            SessionEvent::Presence(presence) => Notice::Presence(presence),
+            SessionEvent::Result(result) => {
+                let mut result = (*result).clone();
+                result.missed = result.number.saturating_sub(self.next);
+                self.next = result.number + 1;
+                Notice::Result(Box::new(result))
+            }
+        });
+    }
+}
+
+/// The client's next message; waits for ever where it sends none.
+async fn next(
+    inbound: &mut Option<Reader<TeleoperateRequest>>,
+) -> Result<Option<TeleoperateRequest>, ServiceError> {
+    match inbound {
+        Some(inbound) => inbound.next().await,
+        None => std::future::pending().await,
     }
 }

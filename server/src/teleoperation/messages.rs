@@ -5,95 +5,96 @@ use emp_models::{
     guard::{self, Execution},
 };
 use emp_proto::v1::{
-    self, DroppedFrame, TeleoperateResponse, TeleoperationPresence, TeleoperationStarted,
-    teleoperate_response::Message,
+    self, DroppedFrame, GoingAway, ObserveResponse, SessionPresence, TeleoperateResponse,
+    TeleoperatedFrame, TeleoperationStarted, observe_response, teleoperate_response,
 };
-use emp_robot::Robot;
 
-use super::{Role, sessions::Member};
-use crate::{catalog::RetargetModel, control::EmpMode, wire};
+use super::joined::Joined;
+use crate::{catalog::PolicyModel, encode};
 
-fn response(message: Message) -> TeleoperateResponse {
-    TeleoperateResponse {
-        message: Some(message),
+/// What a client is told.
+pub(super) enum Notice {
+    Started(Box<TeleoperationStarted>),
+    Result(Box<TeleoperatedFrame>),
+    Dropped(DroppedFrame),
+    Presence(SessionPresence),
+    GoingAway(GoingAway),
+}
+
+impl From<Notice> for TeleoperateResponse {
+    fn from(notice: Notice) -> Self {
+        use teleoperate_response::Message;
+        let message = Some(match notice {
+            Notice::Started(started) => Message::Started(*started),
+            Notice::Result(result) => Message::Result(*result),
+            Notice::Dropped(dropped) => Message::Dropped(dropped),
+            Notice::Presence(presence) => Message::Presence(presence),
+            Notice::GoingAway(notice) => Message::GoingAway(notice),
+        });
+        Self { message }
     }
 }
 
-pub(super) fn result(frame: v1::TeleoperatedFrame) -> TeleoperateResponse {
-    response(Message::Result(frame))
+impl From<Notice> for ObserveResponse {
+    fn from(notice: Notice) -> Self {
+        use observe_response::Message;
+        let message = match notice {
+            Notice::Started(started) => Some(Message::Started(*started)),
+            Notice::Result(result) => Some(Message::Result(*result)),
+            Notice::Presence(presence) => Some(Message::Presence(presence)),
+            Notice::GoingAway(notice) => Some(Message::GoingAway(notice)),
+            // Whoever sends no frames has none dropped.
+            Notice::Dropped(_) => None,
+        };
+        Self { message }
+    }
 }
 
-pub(super) fn dropped(notice: DroppedFrame) -> TeleoperateResponse {
-    response(Message::Dropped(notice))
-}
-
-pub(super) fn presence(presence: TeleoperationPresence) -> TeleoperateResponse {
-    response(Message::Presence(presence))
-}
-
-pub(super) fn started(
-    member: &Member,
-    policy: &v1::Model,
-    retargeter: &RetargetModel,
-) -> TeleoperateResponse {
-    let RetargetModel { card, robot, .. } = retargeter;
-    response(Message::Started(TeleoperationStarted {
+pub(super) fn started<R: From<Notice>>(joined: &Joined) -> R {
+    let Joined {
+        member,
+        policy,
+        retargeting,
+        ..
+    } = joined;
+    let PolicyModel { card, robot, .. } = &**policy;
+    let retargeter = retargeting.as_ref().map(|by| &by.model.card);
+    let of = |field: fn(&v1::Model) -> &String| retargeter.map(field).cloned().unwrap_or_default();
+    Notice::Started(Box::new(TeleoperationStarted {
         session: member.session().to_owned(),
-        role: role(member.role()).into(),
         robot: card.robot.clone(),
-        policy: policy.name.clone(),
-        policy_version: policy.version.clone(),
-        retargeter: card.name.clone(),
-        retargeter_version: card.version.clone(),
-        goal_joint_names: wire::joint_names(robot.goal_joints()),
-        leg_joint_names: wire::joint_names(robot.leg_joints()),
-        emp_mode: emp_mode(member.emp_mode()).into(),
+        policy: card.name.clone(),
+        policy_version: card.version.clone(),
+        retargeter: of(|card| &card.name),
+        retargeter_version: of(|card| &card.version),
+        goal_joint_names: encode::joint_names(robot.goal_joints()),
+        leg_joint_names: encode::joint_names(robot.leg_joints()),
+        emp_mode: encode::emp_mode(member.emp_mode()).into(),
         presence: Some(member.presence()),
+        resume_token: member.resume_token().to_owned(),
     }))
-}
-
-fn role(role: Role) -> v1::TeleoperationRole {
-    match role {
-        Role::Both => v1::TeleoperationRole::Both,
-        Role::Operator => v1::TeleoperationRole::Operator,
-        Role::Robot => v1::TeleoperationRole::Robot,
-        Role::Observer => v1::TeleoperationRole::Observer,
-    }
-}
-
-pub(super) fn emp_mode(mode: EmpMode) -> v1::EmpMode {
-    match mode {
-        EmpMode::Off => v1::EmpMode::Off,
-        EmpMode::On => v1::EmpMode::On,
-        EmpMode::WhenDanger => v1::EmpMode::WhenDanger,
-    }
+    .into()
 }
 
 /// What the guards did: the one before the EMP, and the one after it.
-pub(super) fn guard_report(
-    robot: &Robot,
-    phase: guard::GoalPhase,
-    output: &ControllerOutput,
-) -> v1::GuardReport {
+pub(super) fn guard_report(phase: guard::GoalPhase, output: &ControllerOutput) -> v1::GuardReport {
     use guard::GoalPhase::{Following, Holding, Ramping, Resting, Returning};
     let unspecified = v1::RampCause::Unspecified;
     let (phase, cause, progress) = match phase {
-        Following => (v1::GoalPhase::Following, unspecified, 0.0),
-        Ramping { cause, progress } => (v1::GoalPhase::Ramping, ramp_cause(cause), progress),
-        Holding => (v1::GoalPhase::Holding, unspecified, 0.0),
-        Returning { progress } => (v1::GoalPhase::Returning, unspecified, progress),
-        Resting => (v1::GoalPhase::Resting, unspecified, 0.0),
+        Following => (v1::GoalPhase::Following, unspecified, None),
+        Ramping { cause, progress } => (v1::GoalPhase::Ramping, ramp_cause(cause), Some(progress)),
+        Holding => (v1::GoalPhase::Holding, unspecified, None),
+        Returning { progress } => (v1::GoalPhase::Returning, unspecified, Some(progress)),
+        Resting => (v1::GoalPhase::Resting, unspecified, None),
     };
     let Execution { fade, limited, .. } = output.execution.clone().unwrap_or_default();
-    let names = limited
-        .iter()
-        .map(|&index| robot.goal_joints()[index].name.clone());
     v1::GuardReport {
         phase: phase.into(),
         cause: cause.into(),
         progress,
         emp_progress: fade,
-        speed_limited_joints: names.collect(),
+        speed_limited_joints: limited.into_iter().map(encode::count).collect(),
+        ..v1::GuardReport::default()
     }
 }
 

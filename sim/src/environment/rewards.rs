@@ -36,6 +36,14 @@ macro_rules! rewards {
             fn array(&self) -> [f64; REWARD_TERMS] {
                 [$(self.$term,)*]
             }
+
+            /// The weight of the term with this name, if there is one.
+            pub fn of_term(&mut self, name: &str) -> Option<&mut f64> {
+                $(if name == stringify!($term) {
+                    return Some(&mut self.$term);
+                })*
+                None
+            }
         }
 
         /// The terms' expressions, before weighting.

@@ -3,6 +3,7 @@
 pub mod curriculum;
 pub mod curves;
 pub mod data;
+mod environment;
 pub mod judge;
 pub mod learner;
 pub mod moments;

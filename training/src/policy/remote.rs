@@ -13,6 +13,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use emp_client::{
     Backoff, Client, ClientError, ClipSource, CollectFinished, CollectRequest,
     CollectRolloutsConfig, Collection, GoalClip, RolloutBlock, StepEnd, TrainingEnd,
+    TrainingEpisode,
 };
 use emp_robot::Robot;
 use emp_sim::{
@@ -24,7 +25,7 @@ use tokio::runtime::Runtime;
 use tonic::Code;
 
 use super::{
-    Settings,
+    Settings, environment,
     source::{Collected, PolicySnapshot, RolloutSource},
 };
 
@@ -68,7 +69,7 @@ impl RemoteSource {
                     environments: u32::try_from(range.len())?,
                     first_environment: range.start as u64,
                     seed: settings.seed,
-                    environment_settings: serde_json::to_string(&settings.environment)?,
+                    environment: Some(environment::message(&settings.environment)),
                     ..CollectRolloutsConfig::default()
                 },
                 library: Arc::clone(&library),
@@ -111,13 +112,14 @@ impl RolloutSource for RemoteSource {
         self.iteration += 1;
         let request = CollectRequest {
             iteration: self.iteration,
-            policy: snapshot.policy.encode()?,
             log_standard_deviation: snapshot.log_std.clone(),
             horizon: u32::try_from(horizon)?,
             randomization: snapshot.randomization,
             difficulty: snapshot.difficulty,
         };
         let environments = self.environments;
+        let policy: Arc<[u8]> = snapshot.policy.encode()?.into();
+        let request = Request { policy, request };
         let parts = self.each(|server| server.collect(request.clone()))?;
         Ok(Collected {
             rollout: assembled(&parts, environments, horizon)?,
@@ -160,7 +162,14 @@ struct Server {
     collection: Option<Collection>,
     /// Where the environments stood before the requests in the journal; none: at their start.
     snapshot: Option<Vec<u8>>,
-    journal: Vec<CollectRequest>,
+    journal: Vec<Request>,
+}
+
+/// A request and the policy that it is about.
+#[derive(Clone)]
+struct Request {
+    policy: Arc<[u8]>,
+    request: CollectRequest,
 }
 
 /// What one server collected.
@@ -172,7 +181,7 @@ struct Part {
 
 impl Server {
     /// Runs the environments, again and again if the server goes away.
-    async fn collect(&mut self, request: CollectRequest) -> Result<Part> {
+    async fn collect(&mut self, request: Request) -> Result<Part> {
         let backoff = Backoff::default();
         let (start, mut pause) = (Instant::now(), backoff.first);
         let (blocks, finished) = loop {
@@ -200,10 +209,10 @@ impl Server {
 
     async fn attempt(
         &mut self,
-        request: &CollectRequest,
+        Request { policy, request }: &Request,
     ) -> Result<(Vec<RolloutBlock>, CollectFinished), ClientError> {
         let collection = self.connected().await?;
-        collection.collect(request.clone()).await
+        collection.collect(policy, request.clone()).await
     }
 
     /// The call in which the environments live; a new one is brought to where the last one was.
@@ -219,8 +228,8 @@ impl Server {
                 if let Some(snapshot) = &self.snapshot {
                     collection.restore(snapshot).await?;
                 }
-                for request in &self.journal {
-                    collection.collect(request.clone()).await?;
+                for Request { policy, request } in &self.journal {
+                    collection.collect(policy, request.clone()).await?;
                 }
                 collection
             }
@@ -292,42 +301,52 @@ fn assembled(parts: &[Part], environments: usize, horizon: usize) -> Result<Roll
     for part in parts {
         for block in &part.blocks {
             let first = part.range.start + block.first_environment as usize;
+            let first_step = block.first_step as usize;
             let place = Place {
                 environments,
                 range: first..first + block.environments as usize,
+                steps: first_step..first_step + block.horizon as usize,
             };
             ensure!(
-                place.range.end <= part.range.end && block.horizon as usize == horizon,
+                place.range.end <= part.range.end && place.steps.end <= horizon,
                 "a server answered with robots or control periods that it was not asked for"
             );
-            covered += place.range.len();
+            covered += place.range.len() * place.steps.len();
             place.write(block, horizon, &mut rollout)?;
         }
     }
     ensure!(
-        covered == environments,
-        "the servers answered with {covered} robots, expected {environments}"
+        covered == rows,
+        "the servers answered with {covered} rows, expected {rows}"
     );
     rollout.timed_out_privileged.sort_by_key(|(row, _)| *row);
     rollout.statistics = statistics(parts, &rollout)?;
     Ok(rollout)
 }
 
-/// Where a block's robots stand among all.
+/// Where a block's robots and control periods stand among all.
 struct Place {
     environments: usize,
     range: Range<usize>,
+    steps: Range<usize>,
 }
 
 impl Place {
     fn write(&self, block: &RolloutBlock, horizon: usize, rollout: &mut Rollout) -> Result<()> {
         self.scatter(&block.features, horizon, &mut rollout.features)?;
         self.scatter(&block.privileged, horizon, &mut rollout.privileged)?;
-        self.scatter(&block.last_privileged, 1, &mut rollout.last_privileged)?;
+        if self.steps.end == horizon {
+            let last = Self {
+                range: self.range.clone(),
+                steps: 0..1,
+                ..*self
+            };
+            last.scatter(&block.last_privileged, 1, &mut rollout.last_privileged)?;
+        }
         self.scatter(&block.means, horizon, &mut rollout.means)?;
         self.scatter(&block.actions, horizon, &mut rollout.actions)?;
         self.scatter(&block.rewards, horizon, &mut rollout.rewards)?;
-        let expected = horizon * self.range.len();
+        let expected = self.steps.len() * self.range.len();
         ensure!(
             block.ends.len() == expected,
             "a server answered with {} ends, expected {expected}",
@@ -340,7 +359,7 @@ impl Place {
         for state in &block.timed_out {
             let (t, n) = (state.step as usize, state.environment as usize);
             ensure!(
-                t < horizon && n < self.range.len(),
+                t < self.steps.len() && n < self.range.len(),
                 "a server answered with a state of no robot"
             );
             let privileged = state.privileged.clone();
@@ -351,13 +370,14 @@ impl Place {
         Ok(())
     }
 
+    /// The row of the block's control period t and robot n among all.
     fn row(&self, t: usize, n: usize) -> usize {
-        t * self.environments + self.range.start + n
+        (self.steps.start + t) * self.environments + self.range.start + n
     }
 
-    /// Copies `steps` batches of rows of these robots into batches of rows of all.
-    fn scatter(&self, values: &[f32], steps: usize, all: &mut Vec<f32>) -> Result<()> {
-        let count = self.range.len();
+    /// Copies a block's rows to where they stand among those of `horizon` control periods of all robots.
+    fn scatter(&self, values: &[f32], horizon: usize, all: &mut Vec<f32>) -> Result<()> {
+        let (steps, count) = (self.steps.len(), self.range.len());
         let width = values.len() / (steps * count).max(1);
         ensure!(
             values.len() == steps * count * width,
@@ -365,7 +385,7 @@ impl Place {
             values.len(),
             steps * count
         );
-        let size = steps * self.environments * width;
+        let size = horizon * self.environments * width;
         if all.is_empty() {
             all.resize(size, 0.0);
         }
@@ -404,7 +424,7 @@ fn statistics(parts: &[Part], rollout: &Rollout) -> Result<RolloutStatistics> {
             rows.len()
         );
         for (row, episode) in rows.into_iter().zip(&part.finished.episodes) {
-            let end = end_reason(episode.end())?;
+            let end = end_reason(episode)?;
             let length = episode.length;
             episodes.push((row, Episode { length, end }));
         }
@@ -426,18 +446,20 @@ fn step_end(end: StepEnd) -> Result<End> {
     })
 }
 
-fn end_reason(end: TrainingEnd) -> Result<EndReason> {
-    Ok(match end {
+fn end_reason(episode: &TrainingEpisode) -> Result<EndReason> {
+    Ok(match episode.end() {
         TrainingEnd::Tilted => EndReason::Tilted,
         TrainingEnd::Sank => EndReason::Sank,
         TrainingEnd::TimedOut => EndReason::TimedOut,
-        TrainingEnd::DivergedInertia => EndReason::Diverged(Divergence::Inertia),
-        TrainingEnd::DivergedContacts => EndReason::Diverged(Divergence::Contacts),
-        TrainingEnd::DivergedConstraints => EndReason::Diverged(Divergence::Constraints),
-        TrainingEnd::DivergedPosition => EndReason::Diverged(Divergence::Position),
-        TrainingEnd::DivergedVelocity => EndReason::Diverged(Divergence::Velocity),
-        TrainingEnd::DivergedAcceleration => EndReason::Diverged(Divergence::Acceleration),
-        TrainingEnd::DivergedControl => EndReason::Diverged(Divergence::Control),
+        TrainingEnd::Diverged => {
+            let divergence = Divergence::named(&episode.divergence).with_context(|| {
+                format!(
+                    "a server answered that {:?} diverged; is it newer?",
+                    episode.divergence
+                )
+            })?;
+            EndReason::Diverged(divergence)
+        }
         TrainingEnd::Unspecified => bail!("a server answered with no end; is it newer?"),
     })
 }

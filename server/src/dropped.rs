@@ -2,7 +2,13 @@
 
 use emp_proto::v1::{DropReason, DroppedFrame, FrameHeader};
 
-use crate::{batcher::Rejected, error::FieldError, queue::JobError};
+use crate::{
+    error::FieldError,
+    inference::{
+        batcher::{Rejected, Unanswered},
+        queue::JobError,
+    },
+};
 
 /// A frame was not computed.
 #[derive(Debug, PartialEq)]
@@ -47,6 +53,16 @@ impl From<FieldError> for NotComputed {
         Self {
             field,
             ..Self::new(DropReason::Invalid, description)
+        }
+    }
+}
+
+impl From<Unanswered> for NotComputed {
+    fn from(why: Unanswered) -> Self {
+        match why {
+            Unanswered::Late => Self::late(),
+            Unanswered::Rejected(rejected) => rejected.into(),
+            Unanswered::Failed(error) => error.into(),
         }
     }
 }

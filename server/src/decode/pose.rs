@@ -4,7 +4,11 @@ use emp_motion::{FrameError, KEY_NODES, KeyNode, KeyNodeFrame};
 use emp_proto::v1::{HumanPose, Position, Quaternion};
 use nalgebra::{Rotation3, Vector3};
 
-use crate::{check, error::FieldError};
+use super::fields;
+use crate::error::FieldError;
+
+/// Largest distance of a node from the waist, metres.
+const FARTHEST: f32 = 5.0;
 
 /// Reads a pose and moves its origin to the waist. Field paths start at the message that holds `pose`.
 pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError> {
@@ -13,14 +17,14 @@ pub(crate) fn read(pose: Option<&HumanPose>) -> Result<KeyNodeFrame, FieldError>
 }
 
 /// Reads a pose and moves its origin to the waist; `path` is where it stands in its message.
-pub(crate) fn read_at(path: &str, pose: &HumanPose) -> Result<KeyNodeFrame, FieldError> {
+fn read_at(path: &str, pose: &HumanPose) -> Result<KeyNodeFrame, FieldError> {
     let nodes = nodes(pose);
     let given = nodes.iter().flatten().count();
     let mut positions = [Vector3::zeros(); KEY_NODES];
     for (node, position) in KeyNode::ALL.into_iter().zip(nodes) {
         let position = position.ok_or_else(|| {
             let description =
-                format!("it is missing; a pose has {KEY_NODES} key nodes, this one {given}");
+                format!("it is missing; the retargeter needs all {KEY_NODES} key nodes, this pose has {given}");
             FieldError::new(format!("{path}.{}", node.name()), description)
         })?;
         positions[node as usize] = read_position(&format!("{path}.{}", node.name()), position)?;
@@ -43,10 +47,38 @@ pub(crate) fn read_at(path: &str, pose: &HumanPose) -> Result<KeyNodeFrame, Fiel
         positions,
         wrist_rotations,
     };
+    // Where the retargeter does not need them they are checked all the same.
+    if let Some(head) = &pose.head {
+        let head = read_position(&format!("{path}.head"), head)?;
+        if (head - waist).norm() > FARTHEST {
+            let description = format!("more than {FARTHEST} m from the waist");
+            return Err(FieldError::new(format!("{path}.head"), description));
+        }
+    }
+    read_rotation(
+        &format!("{path}.head_orientation"),
+        pose.head_orientation.as_ref(),
+    )?;
     frame.validate().map_err(|error| {
         FieldError::new(format!("{path}.{}", field_of(&error)), error.to_string())
     })?;
     Ok(frame)
+}
+
+/// The heading of the shoulders in a pose: the yaw that takes x to where the chest faces, rad.
+pub(crate) fn heading(frame: &KeyNodeFrame) -> f32 {
+    let [left, right] = [KeyNode::LeftShoulder, KeyNode::RightShoulder];
+    let across = frame.positions[left as usize] - frame.positions[right as usize];
+    (-across.x).atan2(across.y)
+}
+
+/// The pose turned about the vertical by `yaw`, rad.
+pub(crate) fn turned(frame: &KeyNodeFrame, yaw: f32) -> KeyNodeFrame {
+    let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw);
+    KeyNodeFrame {
+        positions: frame.positions.map(|position| turn * position),
+        wrist_rotations: frame.wrist_rotations.map(|wrist| wrist.map(|w| turn * w)),
+    }
 }
 
 /// The key nodes of a message, in the order of [`KeyNode::ALL`].
@@ -65,7 +97,7 @@ fn nodes(pose: &HumanPose) -> [Option<&Position>; KEY_NODES] {
 
 fn read_position(path: &str, position: &Position) -> Result<Vector3<f32>, FieldError> {
     let Position { x, y, z } = *position;
-    check::finite(path, [("x", x), ("y", y), ("z", z)])?;
+    fields::finite(path, [("x", x), ("y", y), ("z", z)])?;
     Ok(Vector3::new(x, y, z))
 }
 
@@ -74,7 +106,7 @@ fn read_rotation(
     quaternion: Option<&Quaternion>,
 ) -> Result<Option<Rotation3<f32>>, FieldError> {
     quaternion
-        .map(|quaternion| check::rotation(path, quaternion))
+        .map(|quaternion| fields::rotation(path, quaternion))
         .transpose()
         .map(|rotation| rotation.map(|rotation| rotation.cast().to_rotation_matrix()))
 }
@@ -114,6 +146,7 @@ mod tests {
                 z: 0.0,
             }),
             right_wrist_orientation: None,
+            ..HumanPose::default()
         }
     }
 
@@ -139,7 +172,7 @@ mod tests {
         assert_eq!(read(None).expect_err("refused").field, "pose");
         let missing = refused(|pose| pose.right_elbow = None);
         assert_eq!(missing.field, "pose.right_elbow");
-        assert!(missing.description.contains("this one 7"), "{missing}");
+        assert!(missing.description.contains("this pose has 7"), "{missing}");
         for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let error = refused(|pose| pose.left_wrist = position(0.1, value, 0.0));
             assert_eq!(error.field, "pose.left_wrist.y");
@@ -168,6 +201,35 @@ mod tests {
             });
         });
         assert_eq!(nan.field, "pose.left_wrist_orientation.w");
+    }
+
+    #[test]
+    fn the_heading_of_a_pose_can_be_taken_out() {
+        let frame = read(Some(&pose())).expect("a good pose");
+        for yaw in [-2.0, 0.0, 0.7] {
+            let facing = turned(&frame, yaw);
+            assert!((heading(&facing) - yaw).abs() < 1e-5);
+            let back = turned(&facing, -heading(&facing));
+            let off = back.positions.iter().zip(&frame.positions);
+            assert!(off.map(|(a, b)| (a - b).norm()).sum::<f32>() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn a_head_and_hands_name_what_the_retargeter_misses() {
+        let headset = HumanPose {
+            head: position(0.0, 0.0, 1.7),
+            left_wrist: position(0.3, 0.2, 1.2),
+            right_wrist: position(0.3, -0.2, 1.2),
+            ..HumanPose::default()
+        };
+        let error = read(Some(&headset)).expect_err("refused");
+        assert_eq!(error.field, "pose.waist");
+        assert!(error.description.contains("needs all 8"), "{error}");
+        let far = refused(|pose| pose.head = position(9.0, 0.0, 0.0));
+        assert_eq!(far.field, "pose.head");
+        let nan = refused(|pose| pose.head = position(f32::NAN, 0.0, 0.0));
+        assert_eq!(nan.field, "pose.head.x");
     }
 
     #[test]

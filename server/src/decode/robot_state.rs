@@ -1,5 +1,7 @@
 //! A robot's state, goal and past off the wire: checked field by field against the robot.
 
+use std::time::Duration;
+
 use emp_models::{
     controller::ControllerState,
     filters::EmpFilter,
@@ -9,17 +11,38 @@ use emp_proto::v1;
 use emp_robot::Robot;
 use nalgebra::UnitQuaternion;
 
+use super::deadline;
+use super::fields::{self, LARGEST_ACTION};
 use crate::{
-    check,
-    control::{ControlInput, EmpMode},
     error::FieldError,
+    inference::controllers::{ControlInput, EmpMode},
 };
+
+/// Largest speed of a joint or of the base, rad/s.
+const LARGEST_SPEED: f32 = 1_000.0;
+
+/// What a robot measures at one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Measured {
+    /// Angles of all joints, goal joints first, rad.
+    pub(crate) joint_positions: Vec<f32>,
+    /// Orientation of the base.
+    pub(crate) orientation: UnitQuaternion<f64>,
+    /// When, on the robot's own clock.
+    pub(crate) time: Option<Duration>,
+}
+
+impl Measured {
+    /// Whether the sensors say the same, number for number.
+    pub(crate) fn is_same_as(&self, other: &Self) -> bool {
+        self.joint_positions == other.joint_positions && self.orientation == other.orientation
+    }
+}
 
 /// What a robot measures and what it is to do, of one control period.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct ControlPeriod {
-    pub(crate) joint_positions: Vec<f32>,
-    pub(crate) orientation: UnitQuaternion<f64>,
+    pub(crate) measured: Measured,
     pub(crate) goal: Vec<f32>,
 }
 
@@ -31,60 +54,69 @@ impl ControlPeriod {
         goal: &[f32],
         robot: &Robot,
     ) -> Result<Self, FieldError> {
-        let (joint_positions, orientation) = read_state(&format!("{prefix}state"), state, robot)?;
-        check::angles(&format!("{prefix}goal"), goal, robot.goal_joints().iter())?;
+        let measured = read_state(&format!("{prefix}state"), state, robot)?;
+        fields::angles(&format!("{prefix}goal"), goal, robot.goal_joints().iter())?;
         Ok(Self {
-            joint_positions,
-            orientation,
+            measured,
             goal: goal.to_vec(),
         })
     }
 
     /// This control period after `past`.
     pub(crate) fn after(self, past: ControllerState, mode: EmpMode) -> ControlInput {
-        let Self {
-            joint_positions,
-            orientation,
-            goal,
-        } = self;
+        let Self { measured, goal } = self;
         ControlInput {
             mode,
             state: past,
-            joint_positions,
-            orientation,
+            joint_positions: measured.joint_positions,
+            orientation: measured.orientation,
             goal,
         }
     }
 }
 
-/// Reads a robot's joint positions and the orientation of its base; `path` is where they stand in their message.
+/// Reads what a robot measures; `path` is where it stands in its message.
 pub(crate) fn read_state(
     path: &str,
     state: Option<&v1::RobotState>,
     robot: &Robot,
-) -> Result<(Vec<f32>, UnitQuaternion<f64>), FieldError> {
+) -> Result<Measured, FieldError> {
     let state = state.ok_or_else(|| FieldError::new(path, "it is missing"))?;
+    let below = |name: &str| format!("{path}.{name}");
     let positions = &state.joint_positions;
-    check::angles(
-        &format!("{path}.joint_positions"),
-        positions,
-        robot.joints(),
-    )?;
-    let path = format!("{path}.base_orientation");
+    fields::angles(&below("joint_positions"), positions, robot.joints())?;
+    let velocities = &state.joint_velocities;
+    if !velocities.is_empty() {
+        let path = below("joint_velocities");
+        fields::bounded(&path, velocities, positions.len(), LARGEST_SPEED)?;
+    }
+    if let Some(v1::AngularVelocity { x, y, z }) = state.base_angular_velocity {
+        let path = below("base_angular_velocity");
+        for (name, value) in [("x", x), ("y", y), ("z", z)] {
+            fields::finite(&path, [(name, value)])?;
+            fields::within(
+                &format!("{path}.{name}"),
+                value,
+                -LARGEST_SPEED..=LARGEST_SPEED,
+            )?;
+        }
+    }
+    let path = below("base_orientation");
     let orientation = state.base_orientation.as_ref();
     let orientation = orientation.ok_or_else(|| FieldError::new(&path, "it is missing"))?;
-    Ok((positions.clone(), check::rotation(&path, orientation)?))
+    let time = state.measurement_time.as_ref();
+    let time = time.map(|time| deadline::duration(&below("measurement_time"), time));
+    Ok(Measured {
+        joint_positions: positions.clone(),
+        orientation: fields::rotation(&path, orientation)?,
+        time: time.transpose()?,
+    })
 }
 
-/// The mode that a field asks for; `default` where it asks for none.
-pub(crate) fn read_mode(
-    field: &str,
-    number: i32,
-    default: EmpMode,
-    has_emp: bool,
-) -> Result<EmpMode, FieldError> {
+/// The mode that a field asks for: on where it is not specified and the robot has an EMP.
+pub(crate) fn read_mode(field: &str, number: i32, has_emp: bool) -> Result<EmpMode, FieldError> {
     let mode = match v1::EmpMode::try_from(number) {
-        Ok(v1::EmpMode::Unspecified) => default,
+        Ok(v1::EmpMode::Unspecified) => EmpMode::usual(has_emp),
         Ok(v1::EmpMode::Off) => EmpMode::Off,
         Ok(v1::EmpMode::On) => EmpMode::On,
         Ok(v1::EmpMode::WhenDanger) => EmpMode::WhenDanger,
@@ -130,8 +162,8 @@ impl Past<'_> {
         for (index, observation) in before.iter().enumerate() {
             let period = read_observation(index, observation, robot, &mut past)?;
             let state = RobotState {
-                joint_positions: &period.joint_positions,
-                orientation: period.orientation,
+                joint_positions: &period.measured.joint_positions,
+                orientation: period.measured.orientation,
             };
             past.history_mut().push(&state, &period.goal);
         }
@@ -187,6 +219,6 @@ pub(crate) fn read_last_action(
     if action.is_empty() {
         return Ok(vec![0.0; legs]);
     }
-    check::numbers(path, action, legs, "numbers")?;
+    fields::bounded(path, action, legs, LARGEST_ACTION)?;
     Ok(action.to_vec())
 }

@@ -1,12 +1,11 @@
 //! What the batcher asks of a model: a batch in, as many answers out. The transport knows models only through this.
 
-use std::{path::PathBuf, sync::Arc};
+use std::sync::Arc;
 
 use emp_models::{
     ModelError,
     retarget::{RetargetInput, RetargetOutput, Retargeter},
 };
-use emp_robot::Robot;
 
 /// A model that answers whole batches. It lives on one thread of its own and may block there.
 pub trait Backend: Send + 'static {
@@ -15,12 +14,19 @@ pub trait Backend: Send + 'static {
     /// The answer to one item.
     type Output: Send + 'static;
 
-    /// Answers a batch of at least one input, in order. A panic counts as a failure of the model: it fails the batch,
-    /// and the model is built anew.
+    /// Answers a batch of at least one input, in order. A panic counts as a failure of the model, which is then built anew.
     ///
     /// # Errors
-    /// Fails the whole batch; the model stays in use.
+    /// Fails the whole batch, whose items are then tried one by one; the model stays in use.
     fn run(&mut self, batch: &[Self::Input]) -> Result<Vec<Self::Output>, BackendError>;
+
+    /// Refuses an answer that must not leave the server. It fails its item only.
+    ///
+    /// # Errors
+    /// When a number is not finite or absurd.
+    fn check(&self, _output: &Self::Output) -> Result<(), BackendError> {
+        Ok(())
+    }
 }
 
 /// Why a model could not be built or could not answer a batch, in words for a person to read.
@@ -47,40 +53,29 @@ pub type BoxedBackend<I, O> = Box<dyn Backend<Input = I, Output = O>>;
 /// A model that retargets human poses.
 pub type RetargetBackend = BoxedBackend<RetargetInput, RetargetOutput>;
 
-/// Builds a model, at the start and again after it panicked. Runs on the model's own thread.
+/// Builds a model, at the start and again after it panicked, from what is in memory. Runs on the model's own thread.
 pub type Build<I, O> = Box<dyn FnMut() -> Result<BoxedBackend<I, O>, BackendError> + Send>;
 
-/// A model as it was loaded first, then loaded again from its file.
-pub(crate) fn first_then<I: 'static, O: 'static, B>(
-    first: B,
-    mut again: impl FnMut() -> Result<B, ModelError> + Send + 'static,
-) -> Build<I, O>
+/// Builds a model that is there: nothing of it changes while it runs, so a panic leaves nothing to mend.
+pub(crate) fn from_memory<I: 'static, O: 'static, B>(model: B) -> Build<I, O>
 where
-    B: Backend<Input = I, Output = O>,
+    B: Backend<Input = I, Output = O> + Clone,
 {
-    let mut first = Some(first);
-    Box::new(move || {
-        let backend = match first.take() {
-            Some(loaded) => loaded,
-            None => again()?,
-        };
-        Ok(Box::new(backend))
-    })
+    Box::new(move || Ok(Box::new(model.clone())))
 }
 
-/// Loads a retargeter from its weights file, each time anew; without one it is inverse kinematics alone.
-pub(crate) fn retargeter_from(
-    weights: Option<PathBuf>,
-    robot: Arc<Robot>,
-) -> impl Fn() -> Result<Arc<Retargeter>, ModelError> + Send + 'static {
-    move || {
-        let robot = Arc::clone(&robot);
-        match &weights {
-            Some(weights) => Retargeter::load(weights, robot).map(Arc::new),
-            None => Ok(Arc::new(Retargeter::without_network(robot))),
-        }
+/// Refuses numbers that are not finite or beyond `most`, whatever their sign.
+pub(crate) fn sound(what: &str, numbers: &[f32], most: f32) -> Result<(), BackendError> {
+    match numbers.iter().find(|number| !(number.abs() <= most)) {
+        Some(number) => Err(BackendError::new(format!(
+            "it answered {number} as a number of {what}"
+        ))),
+        None => Ok(()),
     }
 }
+
+/// Most that an angle may be, radians: more than any joint can turn.
+pub(crate) const LARGEST_ANGLE: f32 = 100.0;
 
 impl Backend for Arc<Retargeter> {
     type Input = RetargetInput;
@@ -88,6 +83,15 @@ impl Backend for Arc<Retargeter> {
 
     fn run(&mut self, batch: &[RetargetInput]) -> Result<Vec<RetargetOutput>, BackendError> {
         Ok(self.retarget(batch)?)
+    }
+
+    fn check(&self, output: &RetargetOutput) -> Result<(), BackendError> {
+        sound("the goal", &output.angles, LARGEST_ANGLE)?;
+        sound(
+            "the direction error",
+            &[output.direction_error],
+            LARGEST_ANGLE,
+        )
     }
 }
 
@@ -97,5 +101,9 @@ impl<I: Send + 'static, O: Send + 'static> Backend for BoxedBackend<I, O> {
 
     fn run(&mut self, batch: &[I]) -> Result<Vec<O>, BackendError> {
         (**self).run(batch)
+    }
+
+    fn check(&self, output: &O) -> Result<(), BackendError> {
+        (**self).check(output)
     }
 }

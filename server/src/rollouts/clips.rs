@@ -7,9 +7,10 @@ use emp_motion::{Clip, skills};
 use emp_proto::v1::ProceduralClips;
 use emp_sim::goals::{GoalClip, Source};
 
-use super::{job::failed, read};
+use super::job::failed;
 use crate::{
     catalog::RetargetModel,
+    decode::{fields, rollouts::Budget},
     error::{FieldError, ServiceError},
 };
 
@@ -18,12 +19,19 @@ const MAX_PROCEDURAL: u32 = 10_000;
 /// Clips that a thread retargets between two questions whether to stop.
 const BLOCK: usize = 4;
 
-/// Reads how many procedural clips are asked for, and their seed.
+/// Longest procedural clip, seconds.
+const LONGEST_PROCEDURAL: f64 = 20.0;
+
+/// Reads how many procedural clips are asked for, and their seed; their frames come out of the budget.
 pub(super) fn read_procedural(
     procedural: Option<&ProceduralClips>,
+    control_rate: f64,
+    budget: &mut Budget,
 ) -> Result<(usize, u64), FieldError> {
     let ProceduralClips { count, seed } = procedural.copied().unwrap_or_default();
-    let count = read::within("config.procedural.count", count, 0..=MAX_PROCEDURAL)?;
+    let count = fields::within("config.procedural.count", count, 0..=MAX_PROCEDURAL)?;
+    let longest = (LONGEST_PROCEDURAL * control_rate).ceil() as usize;
+    budget.spend("config.procedural.count", count as usize * longest)?;
     Ok((count as usize, seed))
 }
 
@@ -35,9 +43,13 @@ pub(super) fn network(model: &RetargetModel) -> Result<Arc<Retargeter>, ServiceE
         .ok_or_else(|| ServiceError::JobFailed(format!("{} serves frames only", model.card.name)))
 }
 
-/// The procedural clips with this seed.
-pub(super) fn procedural((count, seed): (usize, u64)) -> Vec<Clip> {
-    skills::library(seed, count)
+/// The procedural clips with this seed. `check` may stop it.
+pub(super) fn procedural(
+    (count, seed): (usize, u64),
+    check: impl Fn() -> Result<(), ServiceError>,
+) -> Result<Vec<Clip>, ServiceError> {
+    let clips = skills::endless(seed).take(count);
+    clips.map(|clip| check().map(|()| clip)).collect()
 }
 
 /// Retargets clips in order. `progress` is told how many are done, and may stop it.

@@ -1,6 +1,6 @@
 //! The bounded queue in front of one model: streams before unary calls, and among those the one that is due first.
 //!
-//! It is plain data without locks or threads; [`crate::batcher`] puts it behind a mutex.
+//! It is plain data without locks or threads; [`super::batcher`] puts it behind a mutex.
 
 use std::{
     collections::BTreeMap,
@@ -9,8 +9,11 @@ use std::{
 
 use tokio::sync::oneshot;
 
-/// A job without a deadline is due this long after its arrival, so that jobs with deadlines cannot starve it.
-const PATIENCE: Duration = Duration::from_millis(200);
+/// A job is due between these times after its arrival, whatever its deadline: a short one does not get ahead of everybody, a long
+/// one or none does not fall behind everybody.
+const DUE: [Duration; 2] = [Duration::from_millis(20), Duration::from_millis(200)];
+/// Most unary calls in a batch: streams that come meanwhile do not wait for more.
+const UNARY_IN_BATCH: usize = 4;
 
 /// Who waits for a job. The order is the order of service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -60,10 +63,36 @@ pub(crate) struct Answer<O> {
 pub(crate) type Outcome<O> = Result<Answer<O>, JobError>;
 
 pub(crate) struct Job<I, O> {
-    pub(crate) input: I,
-    pub(crate) arrived: Instant,
+    input: I,
+    arrived: Instant,
     deadline: Option<Instant>,
-    pub(crate) reply: oneshot::Sender<Outcome<O>>,
+    reply: oneshot::Sender<Outcome<O>>,
+}
+
+/// What is left of a job while a model has its input.
+pub(crate) struct Waiting<O> {
+    /// From its arrival to the start of its batch.
+    pub(crate) queue_time: Duration,
+    arrived: Instant,
+    deadline: Option<Instant>,
+    reply: oneshot::Sender<Outcome<O>>,
+}
+
+impl<O> Waiting<O> {
+    pub(crate) fn finish(self, outcome: Outcome<O>) {
+        // A receiver that is gone has lost interest: its call was cancelled.
+        let _ = self.reply.send(outcome);
+    }
+
+    /// The job with its input again.
+    pub(crate) fn rejoined<I>(self, input: I) -> Job<I, O> {
+        Job {
+            input,
+            arrived: self.arrived,
+            deadline: self.deadline,
+            reply: self.reply,
+        }
+    }
 }
 
 impl<I, O> Job<I, O> {
@@ -83,15 +112,27 @@ impl<I, O> Job<I, O> {
         )
     }
 
+    /// The input for the model, whose batch begins now, and what waits meanwhile.
+    pub(crate) fn split(self, now: Instant) -> (I, Waiting<O>) {
+        let waiting = Waiting {
+            queue_time: now - self.arrived,
+            arrived: self.arrived,
+            deadline: self.deadline,
+            reply: self.reply,
+        };
+        (self.input, waiting)
+    }
+
     fn due(&self) -> Instant {
-        self.deadline.unwrap_or(self.arrived + PATIENCE)
+        let [soonest, latest] = DUE.map(|after| self.arrived + after);
+        self.deadline.unwrap_or(latest).clamp(soonest, latest)
     }
 
     fn is_late(&self, now: Instant) -> bool {
         self.deadline.is_some_and(|deadline| deadline <= now)
     }
 
-    pub(crate) fn finish(self, outcome: Outcome<O>) {
+    fn finish(self, outcome: Outcome<O>) {
         // A receiver that is gone has lost interest: its call was cancelled.
         let _ = self.reply.send(outcome);
     }
@@ -100,6 +141,8 @@ impl<I, O> Job<I, O> {
 /// Waiting jobs; at most `limit` of each priority, so that neither kind can crowd out the other.
 pub(crate) struct Queue<I, O> {
     jobs: BTreeMap<Key, Job<I, O>>,
+    /// How many of them are unary calls.
+    unary: usize,
     limit: usize,
     next_number: u64,
 }
@@ -108,6 +151,7 @@ impl<I, O> Queue<I, O> {
     pub(crate) fn new(limit: usize) -> Self {
         Self {
             jobs: BTreeMap::new(),
+            unary: 0,
             limit,
             next_number: 0,
         }
@@ -121,21 +165,26 @@ impl<I, O> Queue<I, O> {
         self.jobs.is_empty()
     }
 
-    pub(crate) fn is_full(&self, priority: Priority) -> bool {
-        self.jobs
-            .keys()
-            .filter(|key| key.priority == priority)
-            .count()
-            >= self.limit
+    fn is_full(&self, priority: Priority) -> bool {
+        let waiting = match priority {
+            Priority::Stream => self.jobs.len() - self.unary,
+            Priority::Unary => self.unary,
+        };
+        waiting >= self.limit
+    }
+
+    /// Whether there is room for another job, once those are gone that nobody waits for any more.
+    pub(crate) fn has_room(&mut self, priority: Priority) -> bool {
+        if self.is_full(priority) {
+            self.discard_dead(Instant::now());
+        }
+        !self.is_full(priority)
     }
 
     /// Adds a job, or gives it back when there is no room. Cancelled and late jobs make room first.
-    pub(crate) fn push(&mut self, priority: Priority, job: Job<I, O>) -> Result<Key, Job<I, O>> {
-        if self.is_full(priority) {
-            self.discard_dead(Instant::now());
-            if self.is_full(priority) {
-                return Err(job);
-            }
+    pub(crate) fn push(&mut self, priority: Priority, job: Job<I, O>) -> Result<(), Job<I, O>> {
+        if !self.has_room(priority) {
+            return Err(job);
         }
         let key = Key {
             priority,
@@ -143,40 +192,26 @@ impl<I, O> Queue<I, O> {
             number: self.next_number,
         };
         self.next_number += 1;
+        self.unary += usize::from(priority == Priority::Unary);
         self.jobs.insert(key, job);
-        Ok(key)
-    }
-
-    /// Puts a newer input in the place of one that still waits and gives back the old one; gives back the new one when
-    /// the job has already been taken.
-    pub(crate) fn replace(
-        &mut self,
-        key: &mut Key,
-        input: I,
-        deadline: Option<Instant>,
-    ) -> Result<I, I> {
-        let Some(mut job) = self.jobs.remove(key) else {
-            return Err(input);
-        };
-        let old = std::mem::replace(&mut job.input, input);
-        job.arrived = Instant::now();
-        job.deadline = deadline;
-        key.due = job.due();
-        self.jobs.insert(*key, job);
-        Ok(old)
+        Ok(())
     }
 
     /// Takes up to `max` jobs that are still wanted, in order of service. Late ones are told so.
     pub(crate) fn take_batch(&mut self, max: usize) -> Vec<Job<I, O>> {
         let now = Instant::now();
-        let mut batch = Vec::new();
-        while batch.len() < max {
-            let Some((_, job)) = self.jobs.pop_first() else {
+        let mut batch: Vec<Job<I, O>> = Vec::new();
+        let mut unary = 0;
+        while batch.len() < max && unary < UNARY_IN_BATCH {
+            let Some((key, job)) = self.jobs.pop_first() else {
                 break;
             };
+            let is_unary = usize::from(key.priority == Priority::Unary);
+            self.unary -= is_unary;
             if job.is_late(now) {
                 job.finish(Err(JobError::DeadlineExceeded));
             } else if !job.reply.is_closed() {
+                unary += is_unary;
                 batch.push(job);
             }
         }
@@ -185,16 +220,16 @@ impl<I, O> Queue<I, O> {
 
     /// Ends every waiting job with an error.
     pub(crate) fn fail_all(&mut self, error: &JobError) {
+        self.unary = 0;
         for job in std::mem::take(&mut self.jobs).into_values() {
             job.finish(Err(error.clone()));
         }
     }
 
     fn discard_dead(&mut self, now: Instant) {
-        for (_, job) in self
-            .jobs
-            .extract_if(.., |_, job| job.reply.is_closed() || job.is_late(now))
-        {
+        let dead = |_: &Key, job: &mut Job<I, O>| job.reply.is_closed() || job.is_late(now);
+        for (key, job) in self.jobs.extract_if(.., dead) {
+            self.unary -= usize::from(key.priority == Priority::Unary);
             job.finish(Err(JobError::DeadlineExceeded));
         }
     }
@@ -211,13 +246,11 @@ mod tests {
         priority: Priority,
         input: u32,
         due_in_ms: Option<u64>,
-    ) -> (Key, oneshot::Receiver<Outcome<u32>>) {
+    ) -> oneshot::Receiver<Outcome<u32>> {
         let deadline = due_in_ms.map(|ms| Instant::now() + Duration::from_millis(ms));
         let (job, outcome) = Job::new(input, deadline);
-        (
-            queue.push(priority, job).map_err(|_| "full").expect("room"),
-            outcome,
-        )
+        queue.push(priority, job).map_err(|_| "full").expect("room");
+        outcome
     }
 
     fn inputs(batch: &[Job<u32, u32>]) -> Vec<u32> {
@@ -234,14 +267,14 @@ mod tests {
             push(&mut queue, Priority::Stream, 4, None),
             push(&mut queue, Priority::Stream, 5, Some(50)),
         ];
-        assert_eq!(inputs(&queue.take_batch(2)), [5, 4]);
-        assert_eq!(inputs(&queue.take_batch(8)), [2, 3, 1]);
+        assert_eq!(inputs(&queue.take_batch(2)), [5, 2]);
+        assert_eq!(inputs(&queue.take_batch(8)), [4, 1, 3]);
     }
 
     #[test]
     fn each_priority_has_its_own_room_and_cancelled_jobs_make_some() {
         let mut queue = TestQueue::new(1);
-        let (_, unary) = push(&mut queue, Priority::Unary, 1, None);
+        let unary = push(&mut queue, Priority::Unary, 1, None);
         let _stream = push(&mut queue, Priority::Stream, 2, None);
         let (refused, _outcome) = Job::new(3, None);
         assert!(queue.push(Priority::Unary, refused).is_err());
@@ -253,7 +286,7 @@ mod tests {
     #[test]
     fn late_jobs_are_told_and_not_computed() {
         let mut queue = TestQueue::new(8);
-        let (_, mut late) = push(&mut queue, Priority::Stream, 1, Some(0));
+        let mut late = push(&mut queue, Priority::Stream, 1, Some(0));
         let _on_time = push(&mut queue, Priority::Stream, 2, Some(60_000));
         assert_eq!(inputs(&queue.take_batch(1)), [2]);
         assert_eq!(
@@ -263,13 +296,25 @@ mod tests {
     }
 
     #[test]
-    fn a_waiting_input_can_be_replaced_until_it_is_taken() {
+    fn a_deadline_gains_and_loses_a_little_only() {
         let mut queue = TestQueue::new(8);
-        let (mut key, _outcome) = push(&mut queue, Priority::Stream, 1, Some(60_000));
-        let sooner = Instant::now() + Duration::from_secs(5);
-        assert_eq!(queue.replace(&mut key, 2, Some(sooner)), Ok(1));
-        assert_eq!(queue.len(), 1);
-        assert_eq!(inputs(&queue.take_batch(8)), [2]);
-        assert_eq!(queue.replace(&mut key, 3, None), Err(3));
+        let _waiting = [
+            push(&mut queue, Priority::Stream, 1, Some(60_000)),
+            push(&mut queue, Priority::Stream, 2, None),
+            push(&mut queue, Priority::Stream, 3, Some(19)),
+            push(&mut queue, Priority::Stream, 4, Some(15)),
+        ];
+        assert_eq!(inputs(&queue.take_batch(8)), [3, 4, 1, 2]);
+    }
+
+    #[test]
+    fn a_flood_of_calls_leaves_room_for_the_streams_that_come_next() {
+        let mut queue = TestQueue::new(64);
+        let _calls: Vec<_> = (0..40)
+            .map(|call| push(&mut queue, Priority::Unary, call, None))
+            .collect();
+        assert_eq!(queue.take_batch(32).len(), UNARY_IN_BATCH);
+        let _frame = push(&mut queue, Priority::Stream, 99, None);
+        assert_eq!(inputs(&queue.take_batch(32))[0], 99);
     }
 }

@@ -1,4 +1,6 @@
-//! Checks that several messages share: numbers, rotations, joint angles. Each names the field that is wrong.
+//! Checks that several messages share: names, numbers, rotations, joint angles. Each names the field that is wrong.
+
+use std::{fmt::Display, ops::RangeInclusive};
 
 use emp_proto::v1::Quaternion;
 use emp_robot::Joint;
@@ -10,6 +12,21 @@ use crate::error::FieldError;
 const QUATERNION_TOLERANCE: f64 = 0.01;
 /// How far outside its limits a joint's angle may be, radians: sensors and soft stops give a little.
 const ANGLE_TOLERANCE: f64 = 0.5;
+
+/// Largest action of a policy, of whatever sign: what it has learnt to answer is a hundredth of that.
+pub(crate) const LARGEST_ACTION: f32 = 100.0;
+
+/// A name that is given, of at most so many bytes.
+pub(crate) fn name(field: &str, name: String, longest: usize) -> Result<String, FieldError> {
+    match name.len() {
+        0 => Err(FieldError::new(field, "it is missing")),
+        length if length > longest => {
+            let description = format!("{length} bytes; expected at most {longest}");
+            Err(FieldError::new(field, description))
+        }
+        _ => Ok(name),
+    }
+}
 
 /// Refuses numbers that are not finite; each has its name below `path`.
 pub(crate) fn finite<const N: usize>(
@@ -60,6 +77,39 @@ pub(crate) fn numbers(
         Some(index) => Err(FieldError::new(
             format!("{path}[{index}]"),
             format!("{}; expected a finite number", values[index]),
+        )),
+        None => Ok(()),
+    }
+}
+
+/// A number inside its range. NaN is in none.
+pub(crate) fn within<T: PartialOrd + Display + Copy>(
+    field: &str,
+    value: T,
+    range: RangeInclusive<T>,
+) -> Result<T, FieldError> {
+    if range.contains(&value) {
+        return Ok(value);
+    }
+    let (least, most) = (range.start(), range.end());
+    Err(FieldError::new(
+        field,
+        format!("{value}; expected {least} to {most}"),
+    ))
+}
+
+/// As many numbers as expected, none beyond `most`, whatever its sign.
+pub(crate) fn bounded(
+    path: &str,
+    values: &[f32],
+    expected: usize,
+    most: f32,
+) -> Result<(), FieldError> {
+    numbers(path, values, expected, "numbers")?;
+    match values.iter().position(|value| value.abs() > most) {
+        Some(index) => Err(FieldError::new(
+            format!("{path}[{index}]"),
+            format!("{}; expected {} to {most}", values[index], -most),
         )),
         None => Ok(()),
     }

@@ -41,29 +41,27 @@ pub(crate) fn of_frame(
     let Some(budget) = header.and_then(|header| header.time_budget) else {
         return Ok(None);
     };
-    let budget = Duration::try_from(budget).map_err(|_| {
-        FieldError::new(
-            "header.time_budget",
-            "it is negative; expected zero or more",
-        )
-    })?;
+    let budget = duration("header.time_budget", &budget)?;
     Ok(received.checked_add(budget))
 }
 
-/// The sooner of two deadlines.
-pub(crate) fn sooner(a: Option<Instant>, b: Option<Instant>) -> Option<Instant> {
-    a.into_iter().chain(b).min()
-}
-
-pub(crate) fn has_passed(deadline: Option<Instant>) -> bool {
-    deadline.is_some_and(|deadline| deadline <= Instant::now())
-}
-
-/// Waits until a deadline; forever if there is none.
-pub(crate) async fn passed(deadline: Option<Instant>) {
-    match deadline {
-        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
-        None => std::future::pending().await,
+/// A time that is not negative.
+pub(crate) fn duration(
+    field: &str,
+    duration: &prost_types::Duration,
+) -> Result<Duration, FieldError> {
+    let prost_types::Duration { seconds, nanos } = *duration;
+    let found = || format!("{seconds} s and {nanos} ns");
+    match (u64::try_from(seconds), u32::try_from(nanos)) {
+        (Ok(seconds), Ok(nanos @ 0..1_000_000_000)) => Ok(Duration::new(seconds, nanos)),
+        (Ok(_), Ok(_)) => {
+            let description = format!("{}; expected less than 10⁹ ns", found());
+            Err(FieldError::new(field, description))
+        }
+        _ => {
+            let description = format!("{}; expected zero or more", found());
+            Err(FieldError::new(field, description))
+        }
     }
 }
 
@@ -105,15 +103,27 @@ mod tests {
     }
 
     #[test]
-    fn a_negative_budget_is_refused_by_name() {
-        let header = FrameHeader {
-            time_budget: Some(prost_types::Duration {
-                seconds: -1,
-                nanos: 0,
-            }),
-            ..FrameHeader::default()
+    fn budgets_at_their_extremes_are_taken_or_refused_by_name() {
+        let of = |seconds, nanos| {
+            let time_budget = Some(prost_types::Duration { seconds, nanos });
+            let header = FrameHeader {
+                time_budget,
+                ..FrameHeader::default()
+            };
+            of_frame(Some(&header), Instant::now())
         };
-        let error = of_frame(Some(&header), Instant::now()).expect_err("negative");
-        assert_eq!(error.field, "header.time_budget");
+        for (seconds, nanos) in [
+            (-1, 0),
+            (0, -1),
+            (i64::MIN, 0),
+            (i64::MIN, i32::MIN),
+            (1, i32::MAX),
+            (i64::MAX, -1),
+        ] {
+            let error = of(seconds, nanos).expect_err("refused");
+            assert_eq!(error.field, "header.time_budget");
+        }
+        assert_eq!(of(i64::MAX, 999_999_999), Ok(None), "no limit");
+        assert!(of(0, 0).expect("zero").is_some());
     }
 }

@@ -1,7 +1,7 @@
 //! A robot's controllers and goal filters as backends: one of each for every mode of the EMP, all over one policy and one
 //! EMP. A batch is split by mode.
 
-use std::{path::PathBuf, sync::Arc};
+use std::sync::Arc;
 
 use emp_models::{
     ModelError,
@@ -10,7 +10,7 @@ use emp_models::{
         Controller, ControllerInput, ControllerOutput, ControllerState, FilteredGoal, filter_goals,
     },
     emp::Emp,
-    filters::{EmpFilter, GoalFilter},
+    filters::{EmpFilter, GoalFilter, Risk},
     guard::Execution,
     observation::{ObservationLayout, RobotState},
     policy::Policy,
@@ -18,7 +18,8 @@ use emp_models::{
 use emp_robot::Robot;
 use nalgebra::UnitQuaternion;
 
-use crate::backend::{Backend, BackendError};
+use super::backend::{Backend, BackendError, LARGEST_ANGLE, sound};
+use crate::decode::fields::LARGEST_ACTION;
 
 /// When an EMP changes a goal.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -34,6 +35,11 @@ pub(crate) enum EmpMode {
 
 impl EmpMode {
     const ALL: [Self; 3] = [Self::Off, Self::On, Self::WhenDanger];
+
+    /// The mode where none is asked for.
+    pub(crate) fn usual(has_emp: bool) -> Self {
+        if has_emp { Self::On } else { Self::Off }
+    }
 }
 
 /// One control period of one robot, and its past.
@@ -130,19 +136,6 @@ impl Controllers {
         Self { off, emp }
     }
 
-    /// Loads the weights, each time anew.
-    pub(crate) fn load(
-        policy: PathBuf,
-        emp: Option<PathBuf>,
-        robot: Arc<Robot>,
-    ) -> impl FnMut() -> Result<Self, ModelError> + Send + 'static {
-        move || {
-            let emp = emp.as_ref().map(|path| Emp::load(path, Arc::clone(&robot)));
-            let policy = Policy::load(&policy, Arc::clone(&robot))?;
-            Ok(Self::new(Arc::new(policy), emp.transpose()?.map(Arc::new)))
-        }
-    }
-
     pub(crate) fn policy(&self) -> &Arc<Policy> {
         self.off.policy()
     }
@@ -197,6 +190,35 @@ impl Backend for Controllers {
     fn run(&mut self, batch: &[ControlInput]) -> Result<Vec<PolicyOutput>, BackendError> {
         by_mode(batch, |mode, inputs| self.step(mode, inputs))
     }
+
+    fn check(&self, output: &PolicyOutput) -> Result<(), BackendError> {
+        let ControllerOutput {
+            goal,
+            action,
+            leg_targets,
+            risk,
+            ..
+        } = &output.output;
+        sound("the goal", goal, LARGEST_ANGLE)?;
+        sound("the action", action, LARGEST_ACTION)?;
+        sound("the leg targets", leg_targets, LARGEST_ANGLE)?;
+        check_assessment(risk.as_ref(), &output.assessment)
+    }
+}
+
+fn check_assessment(risk: Option<&Risk>, assessment: &Assessment) -> Result<(), BackendError> {
+    if let Some(risk) = risk {
+        sound("regloss", &[risk.regloss, risk.applied], f32::MAX)?;
+    }
+    sound("the change", &assessment.change, 2.0 * LARGEST_ANGLE)?;
+    let margin = assessment.center_of_mass_margin;
+    sound("the centre of mass", &[margin], f32::MAX)?;
+    let nearest = assessment.nearest_links.map(|nearest| nearest.distance);
+    sound(
+        "the links' distance",
+        &[nearest.unwrap_or_default()],
+        f32::MAX,
+    )
 }
 
 /// A robot's goal filters.
@@ -216,16 +238,12 @@ impl Filters {
         }
     }
 
-    /// Loads the weights, each time anew.
-    pub(crate) fn load(
-        emp: PathBuf,
-        robot: Arc<Robot>,
-    ) -> impl FnMut() -> Result<Self, ModelError> + Send + 'static {
-        move || Ok(Self::new(Arc::new(Emp::load(&emp, Arc::clone(&robot))?)))
-    }
-
     pub(crate) fn robot(&self) -> &Arc<Robot> {
         self.emp.robot()
+    }
+
+    pub(crate) fn emp(&self) -> &Arc<Emp> {
+        &self.emp
     }
 
     pub(crate) fn layout(&self) -> &ObservationLayout {
@@ -272,6 +290,12 @@ impl Backend for Filters {
 
     fn run(&mut self, batch: &[ControlInput]) -> Result<Vec<FilterOutput>, BackendError> {
         by_mode(batch, |mode, inputs| self.step(mode, inputs))
+    }
+
+    fn check(&self, output: &FilterOutput) -> Result<(), BackendError> {
+        let FilteredGoal { goal, risk, .. } = &output.filtered;
+        sound("the goal", goal, LARGEST_ANGLE)?;
+        check_assessment(risk.as_ref(), &output.assessment)
     }
 }
 
@@ -365,24 +389,5 @@ mod tests {
                 (EmpMode::WhenDanger, 1)
             ]
         );
-    }
-
-    #[test]
-    fn weights_are_loaded_each_time_anew_and_an_emp_that_has_gone_is_an_error() {
-        let robot = robot();
-        let policy = PathBuf::from("../models/weights/emp27-policy.safetensors");
-        let mut load = Controllers::load(policy.clone(), None, Arc::clone(&robot));
-        for _ in 0..2 {
-            let mut controllers = load().expect("the policy ships");
-            let batch = [input(&robot, EmpMode::Off, 0.0)];
-            assert_eq!(controllers.run(&batch).expect("an answer").len(), 1);
-            let batch = [input(&robot, EmpMode::On, 0.0)];
-            let error = controllers.run(&batch).expect_err("no EMP");
-            assert!(error.to_string().contains("emp27 has no EMP"), "{error}");
-        }
-        let gone = PathBuf::from("../models/weights/gone.safetensors");
-        let error = Controllers::load(policy, Some(gone), robot)().err();
-        let error = error.expect("no file").to_string();
-        assert!(error.contains("gone.safetensors"), "{error}");
     }
 }

@@ -10,9 +10,10 @@ use emp_models::{
     retarget::AT_LIMIT,
 };
 use emp_proto::v1;
-use emp_robot::{Joint, Robot};
+use emp_robot::{Foot, Joint, LinkSphere, Robot};
+use prost_types::{ListValue, Struct, Value, value::Kind};
 
-use crate::{control::EmpMode, queue::Answer};
+use crate::inference::{controllers::EmpMode, queue::Answer};
 
 pub(crate) fn timing<O>(answer: &Answer<O>) -> v1::Timing {
     v1::Timing {
@@ -32,8 +33,9 @@ pub(crate) fn retarget_result(
         .goal_joints()
         .iter()
         .zip(&angles)
-        .filter(|(joint, angle)| stands_at_limit(joint, f64::from(**angle)))
-        .map(|(joint, _)| joint.name.clone())
+        .enumerate()
+        .filter(|(_, (joint, angle))| stands_at_limit(joint, f64::from(**angle)))
+        .map(|(index, _)| count(index))
         .collect();
     v1::RetargetResult {
         joint_angles: angles,
@@ -48,7 +50,6 @@ fn stands_at_limit(joint: &Joint, angle: f64) -> bool {
 }
 
 pub(crate) fn policy_result(
-    robot: &Robot,
     mode: EmpMode,
     output: ControllerOutput,
     assessment: Assessment,
@@ -60,8 +61,7 @@ pub(crate) fn policy_result(
         risk,
         ..
     } = output;
-    let filter =
-        (mode != EmpMode::Off).then(|| filter_result(robot, goal.clone(), risk, assessment));
+    let filter = (mode != EmpMode::Off).then(|| filter_result(goal.clone(), risk, assessment));
     v1::PolicyResult {
         executable_goal: goal,
         action,
@@ -71,14 +71,12 @@ pub(crate) fn policy_result(
 }
 
 pub(crate) fn filter_result(
-    robot: &Robot,
     executable_goal: Vec<f32>,
     risk: Option<Risk>,
     assessment: Assessment,
 ) -> v1::FilterResult {
-    let links = robot.link_spheres();
     let nearest = assessment.nearest_links;
-    let names = nearest.map(|nearest| nearest.links.map(|link| links[link].name.clone()));
+    let links = nearest.map(|nearest| nearest.links.map(count));
     let reasons = assessment.reasons.into_iter().map(change_reason);
     v1::FilterResult {
         executable_goal,
@@ -87,8 +85,8 @@ pub(crate) fn filter_result(
         danger: risk.is_some_and(|risk| risk.danger),
         applied: risk.map_or(0.0, |risk| risk.applied),
         center_of_mass_margin: assessment.center_of_mass_margin,
-        smallest_link_distance: nearest.map_or(0.0, |nearest| nearest.distance),
-        nearest_links: names.into_iter().flatten().collect(),
+        smallest_link_distance: nearest.map(|nearest| nearest.distance),
+        nearest_links: links.into_iter().flatten().collect(),
         reasons: reasons.map(i32::from).collect(),
     }
 }
@@ -116,8 +114,38 @@ pub(crate) fn model_card(
         joint_names: joint_names(joints),
         weights_sha256: metadata.sha256.clone(),
         git_revision: metadata.git_revision.clone(),
-        training: metadata.training.to_string(),
+        training: Some(json_object(&metadata.training)),
     }
+}
+
+/// A JSON object as a message; what is none is put into one.
+fn json_object(value: &serde_json::Value) -> Struct {
+    match json(value).kind {
+        Some(Kind::StructValue(object)) => object,
+        kind => Struct {
+            fields: [("value".to_owned(), Value { kind })].into(),
+        },
+    }
+}
+
+fn json(value: &serde_json::Value) -> Value {
+    use serde_json::Value as Json;
+    let kind = match value {
+        Json::Null => Kind::NullValue(0),
+        Json::Bool(value) => Kind::BoolValue(*value),
+        Json::Number(number) => Kind::NumberValue(number.as_f64().unwrap_or(f64::NAN)),
+        Json::String(text) => Kind::StringValue(text.clone()),
+        Json::Array(values) => Kind::ListValue(ListValue {
+            values: values.iter().map(json).collect(),
+        }),
+        Json::Object(fields) => Kind::StructValue(Struct {
+            fields: fields
+                .iter()
+                .map(|(key, value)| (key.clone(), json(value)))
+                .collect(),
+        }),
+    };
+    Value { kind: Some(kind) }
 }
 
 pub(crate) fn joint_names(joints: &[Joint]) -> Vec<String> {
@@ -142,6 +170,31 @@ pub(crate) fn robot(robot: &Robot) -> v1::Robot {
         control_rate: robot.control_rate_hz(),
         key_nodes: key_nodes.collect(),
         action_scale: robot.action_scale(),
+        links: robot.link_spheres().iter().map(link).collect(),
+        feet: robot.feet().iter().map(foot).collect(),
+    }
+}
+
+fn link(link: &LinkSphere) -> v1::Link {
+    let [center_x, center_y, center_z] = link.center;
+    v1::Link {
+        name: link.name.clone(),
+        body: link.body.clone(),
+        center_x,
+        center_y,
+        center_z,
+        radius: link.radius,
+    }
+}
+
+fn foot(foot: &Foot) -> v1::Foot {
+    let contacts = foot.centers.iter();
+    v1::Foot {
+        body: foot.body.clone(),
+        radius: foot.radius,
+        contacts: contacts
+            .map(|&[x, y, z]| v1::ContactPoint { x, y, z })
+            .collect(),
     }
 }
 
@@ -155,6 +208,15 @@ fn joint(joint: &Joint) -> v1::Joint {
         kd: joint.kd,
         torque_limit: joint.torque_limit,
         velocity_limit: joint.velocity_limit,
+    }
+}
+
+/// A mode as messages have it; never unspecified.
+pub(crate) fn emp_mode(mode: EmpMode) -> v1::EmpMode {
+    match mode {
+        EmpMode::Off => v1::EmpMode::Off,
+        EmpMode::On => v1::EmpMode::On,
+        EmpMode::WhenDanger => v1::EmpMode::WhenDanger,
     }
 }
 

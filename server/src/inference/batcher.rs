@@ -12,9 +12,10 @@ use std::{
 
 use tokio::sync::{oneshot, watch};
 
-use crate::{
+use super::due;
+use super::{
     backend::{Backend, BackendError},
-    queue::{Answer, Job, JobError, Key, Outcome, Priority, Queue},
+    queue::{Answer, Job, JobError, Outcome, Priority, Queue},
 };
 
 /// Pauses between attempts to rebuild a model: doubled from the first up to the last.
@@ -56,9 +57,19 @@ pub(crate) struct Batcher<I, O> {
 }
 
 /// A queued job: a future of its outcome. Dropping it cancels the job, unless its batch has begun.
-pub(crate) struct Ticket<O> {
-    key: Key,
+struct Ticket<O> {
     outcome: oneshot::Receiver<Outcome<O>>,
+}
+
+/// Why an input has no answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Unanswered {
+    /// Its deadline passed.
+    Late,
+    /// It was not queued.
+    Rejected(Rejected),
+    /// It was queued, and the model did not answer.
+    Failed(JobError),
 }
 
 struct Shared<I, O> {
@@ -125,11 +136,35 @@ impl<I: Send + 'static, O: Send + 'static> Batcher<I, O> {
         Ok(Self { shared, state })
     }
 
-    /// Queues a job. A job that is dropped, late or cancelled before its batch begins costs nothing.
+    /// Brings one input to the model and waits for its answer, until `deadline`. A call that is dropped before its batch begins costs
+    /// nothing.
     ///
     /// # Errors
-    /// When the queue is full or the model is being rebuilt.
-    pub(crate) fn submit(
+    /// When the queue is full, the deadline passes, or the model fails or is being rebuilt.
+    pub(crate) async fn compute(
+        &self,
+        priority: Priority,
+        input: I,
+        deadline: Option<Instant>,
+    ) -> Result<Answer<O>, Unanswered> {
+        if due::has_passed(deadline) {
+            return Err(Unanswered::Late);
+        }
+        let ticket = self.submit(priority, input, deadline);
+        let outcome = tokio::select! {
+            outcome = ticket.map_err(Unanswered::Rejected)? => outcome,
+            () = due::passed(deadline) => return Err(Unanswered::Late),
+        };
+        match outcome {
+            Ok(_) | Err(JobError::DeadlineExceeded) if due::has_passed(deadline) => {
+                Err(Unanswered::Late)
+            }
+            outcome => outcome.map_err(Unanswered::Failed),
+        }
+    }
+
+    /// Queues a job. A job that is dropped, late or cancelled before its batch begins costs nothing.
+    fn submit(
         &self,
         priority: Priority,
         input: I,
@@ -141,9 +176,9 @@ impl<I: Send + 'static, O: Send + 'static> Batcher<I, O> {
         }
         let (job, outcome) = Job::new(input, deadline);
         match inner.queue.push(priority, job) {
-            Ok(key) => {
+            Ok(()) => {
                 self.shared.changed.notify_one();
-                Ok(Ticket { key, outcome })
+                Ok(Ticket { outcome })
             }
             Err(_) => Err(Rejected::Full(
                 inner.retry_after(self.shared.limits.max_batch),
@@ -151,29 +186,11 @@ impl<I: Send + 'static, O: Send + 'static> Batcher<I, O> {
         }
     }
 
-    /// Puts a newer input in the place of a queued one and gives back the old one.
-    ///
-    /// # Errors
-    /// Gives the new input back when the job's batch has begun.
-    pub(crate) fn replace(
-        &self,
-        ticket: &mut Ticket<O>,
-        input: I,
-        deadline: Option<Instant>,
-    ) -> Result<I, I> {
-        self.shared
-            .lock()
-            .queue
-            .replace(&mut ticket.key, input, deadline)
-    }
-
     /// When to try again, if there is no room for another job of this priority now.
     pub(crate) fn overload(&self, priority: Priority) -> Option<Duration> {
-        let inner = self.shared.lock();
-        inner
-            .queue
-            .is_full(priority)
-            .then(|| inner.retry_after(self.shared.limits.max_batch))
+        let mut inner = self.shared.lock();
+        let has_room = inner.queue.has_room(priority);
+        (!has_room).then(|| inner.retry_after(self.shared.limits.max_batch))
     }
 
     /// The model's state, now and as it changes.
@@ -228,12 +245,12 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
         B: Backend<Input = I, Output = O>,
     {
         while let Some(batch) = self.next_batch() {
-            if let Err(explanation) = self.answer(&mut backend, batch) {
-                tracing::error!(
-                    model = self.name,
-                    explanation,
-                    "the model panicked; rebuilding it"
-                );
+            let mut panicked = false;
+            for retried in self.answer(&mut backend, batch, &mut panicked) {
+                // Alone, so that only those fail that are to blame.
+                self.answer(&mut backend, vec![retried], &mut panicked);
+            }
+            if panicked {
                 let Some(new) = self.rebuild(&mut build) else {
                     return;
                 };
@@ -265,57 +282,59 @@ impl<I: Send + 'static, O: Send + 'static> Worker<I, O> {
         }
     }
 
-    /// Runs one batch and answers its jobs. An error is a panic's message.
-    fn answer<B>(&self, backend: &mut B, batch: Vec<Job<I, O>>) -> Result<(), String>
+    /// Runs one batch and answers its jobs; gives back those of a batch that failed, if there are several. Says whether the model
+    /// panicked.
+    fn answer<B>(
+        &self,
+        backend: &mut B,
+        batch: Vec<Job<I, O>>,
+        panicked: &mut bool,
+    ) -> Vec<Job<I, O>>
     where
         B: Backend<Input = I, Output = O>,
     {
         let start = Instant::now();
-        let (inputs, waiting): (Vec<_>, Vec<_>) = batch
-            .into_iter()
-            .map(|job| (job.input, (start - job.arrived, job.reply)))
-            .unzip();
+        let (inputs, waiting): (Vec<_>, Vec<_>) =
+            batch.into_iter().map(|job| job.split(start)).unzip();
         let outcome = guarded(|| backend.run(&inputs));
         let inference_time = start.elapsed();
-        let (outputs, panic) = match outcome {
-            Ok(Ok(outputs)) if outputs.len() == inputs.len() => (Ok(outputs), None),
-            Ok(Ok(outputs)) => {
-                let explanation =
-                    format!("{} answers to a batch of {}", outputs.len(), inputs.len());
-                (Err(explanation), None)
-            }
-            Ok(Err(error)) => (Err(error.to_string()), None),
-            Err(panic) => (Err(panic.to_string()), Some(panic.to_string())),
-        };
-        if panic.is_some() {
+        self.shared.lock().last_batch = inference_time;
+        if outcome.is_err() {
+            *panicked = true;
             self.set_state(ModelState::Rebuilding);
         }
-        match outputs {
-            Ok(outputs) => {
-                let batch_size = inputs.len();
-                for (output, (queue_time, reply)) in outputs.into_iter().zip(waiting) {
-                    let _ = reply.send(Ok(Answer {
+        let batch_size = inputs.len();
+        let explanation = match outcome {
+            Ok(Ok(outputs)) if outputs.len() == batch_size => {
+                for (output, waiting) in outputs.into_iter().zip(waiting) {
+                    let checked = backend.check(&output).map(|()| output);
+                    let answer = checked.map(|output| Answer {
                         output,
-                        queue_time,
+                        queue_time: waiting.queue_time,
                         inference_time,
                         batch_size,
+                    });
+                    waiting.finish(answer.map_err(|error| {
+                        tracing::warn!(model = self.name, %error, "an answer was refused");
+                        JobError::ModelFailed(error.to_string())
                     }));
                 }
-                self.shared.lock().last_batch = inference_time;
+                return Vec::new();
             }
-            Err(explanation) => {
-                tracing::warn!(
-                    model = self.name,
-                    batch_size = inputs.len(),
-                    explanation,
-                    "a batch failed"
-                );
-                for (_, reply) in waiting {
-                    let _ = reply.send(Err(JobError::ModelFailed(explanation.clone())));
-                }
-            }
+            Ok(Ok(outputs)) => format!("{} answers to a batch of {batch_size}", outputs.len()),
+            Ok(Err(error)) | Err(error) => error.to_string(),
+        };
+        tracing::warn!(model = self.name, batch_size, explanation, "a batch failed");
+        let mut jobs = inputs.into_iter().zip(waiting);
+        if batch_size > 1 {
+            return jobs
+                .map(|(input, waiting)| waiting.rejoined(input))
+                .collect();
         }
-        panic.map_or(Ok(()), Err)
+        if let Some((_, waiting)) = jobs.next() {
+            waiting.finish(Err(JobError::ModelFailed(explanation)));
+        }
+        Vec::new()
     }
 
     /// Builds the model again, however often it takes. What waits meanwhile is refused, since nobody can say how long.
@@ -380,6 +399,7 @@ mod tests {
     };
     const PANIC: u32 = 666;
     const REFUSE: u32 = 400;
+    const UNSOUND: u32 = 500;
 
     /// Doubles numbers. Each batch waits for a permit, so that a test decides when the model is busy.
     struct Doubler {
@@ -397,6 +417,13 @@ mod tests {
                 return Err(BackendError::new("told to refuse"));
             }
             Ok(batch.iter().map(|x| 2 * x).collect())
+        }
+
+        fn check(&self, output: &u32) -> Result<(), BackendError> {
+            match *output == 2 * UNSOUND {
+                true => Err(BackendError::new("told to be unsound")),
+                false => Ok(()),
+            }
         }
     }
 
@@ -479,7 +506,33 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_error_fails_its_batch_only() {
+    async fn one_bad_item_fails_alone() {
+        for (bad, explanation) in [
+            (REFUSE, "told to refuse"),
+            (PANIC, "panic: told to panic"),
+            (UNSOUND, "told to be unsound"),
+        ] {
+            let (permit, permits) = mpsc::channel();
+            let (_, more_permits) = mpsc::channel();
+            let batcher = start(vec![permits, more_permits]);
+            let busy = submit(&batcher, 0);
+            while !batcher.shared.lock().queue.is_empty() {
+                tokio::task::yield_now().await;
+            }
+            let batch = [1, bad, 3].map(|input| submit(&batcher, input));
+            drop(permit);
+            assert!(busy.await.is_ok());
+            let mut answers = Vec::new();
+            for ticket in batch {
+                answers.push(ticket.await.map(|answer| answer.output));
+            }
+            let failed = JobError::ModelFailed(explanation.to_owned());
+            assert_eq!(answers, [Ok(2), Err(failed), Ok(6)]);
+        }
+    }
+
+    #[tokio::test]
+    async fn an_error_leaves_the_model_in_use() {
         let (_, permits) = mpsc::channel();
         let batcher = start(vec![permits]);
         let outcome = submit(&batcher, REFUSE).await;

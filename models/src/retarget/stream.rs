@@ -16,15 +16,20 @@ use super::{Effort, Search, Solver, Target};
 const BASE_SPEED: f64 = 1.8;
 /// How much faster it may turn for each rad/s of the person's arm (for the trunk's joints: of the trunk).
 const SPEED_GAIN: f64 = 1.4;
+/// No joint turns faster, rad/s: about the speed of a punch, and what [`Smoother`](super::Smoother) lets pass.
+const TOP_SPEED: f64 = 12.0;
 /// Weight of the squared travel from the previous answer. Directions weigh [`DIRECTION`](super::objective::weights::DIRECTION):
 /// only where a joint hardly turns a bone, near a singularity, does travel count.
 const TRAVEL: f64 = 1.0;
-/// An arm whose part of the objective is below this has no reason to look for a better way: 100 times the square of 7°.
-const CONTENT: f64 = 1.5;
+/// An arm whose part of the objective is below this has no reason to look for a better way: 100 times the square of 4°.
+const CONTENT: f64 = 0.5;
 /// By how much another way must be better.
-const BETTER_BY: f64 = 1.5;
-/// For how long, seconds.
-const PATIENCE: f64 = 0.15;
+const BETTER_BY: f64 = 0.5;
+/// The other way is taken when staying has cost this much of what going there costs. Both are the root of the objective
+/// (10 times an angle) over time. Going costs less than is estimated, for joints that have time make up for the others.
+const REGRET: f64 = 0.2;
+/// On the way to another branch, joints that need less than this share of the time stay free to follow the person.
+const FREE: f64 = 0.5;
 
 /// What a stream's first frame and the search for a better way spend.
 const SEARCH: Effort = Effort {
@@ -81,8 +86,8 @@ pub struct Memory {
 struct Rival {
     /// The whole answer, of which the arm's joints count.
     angles: Vec<f64>,
-    /// For how long it has been better, seconds.
-    better_for: f64,
+    /// What it has cost so far not to be there: the difference of the objective's roots over time, in seconds.
+    regret: f64,
     /// Whether the arm is on its way there.
     walking: bool,
 }
@@ -166,7 +171,7 @@ impl Solver<'_> {
         memory.answer = answer;
         let objectives = self.arm_objectives(target, &memory.answer);
         for side in 0..2 {
-            self.look_around(target, &mut memory, side, objectives[side], seconds);
+            self.look_around(target, &mut memory, side, objectives[side], &reach, seconds);
         }
         memory
     }
@@ -181,7 +186,8 @@ impl Solver<'_> {
                 Some(side) => fastest(&|turns: &Turns| turns.arms[side]),
                 None => fastest(&|turns: &Turns| turns.trunk),
             };
-            let speed = (BASE_SPEED + SPEED_GAIN * turn).min(joint.velocity_limit);
+            let speed = BASE_SPEED + SPEED_GAIN * turn;
+            let speed = speed.min(joint.velocity_limit).min(TOP_SPEED);
             reach.push(speed * seconds);
         }
         reach
@@ -202,7 +208,7 @@ impl Solver<'_> {
             .unzip()
     }
 
-    /// Where an arm is on its way to another branch, holds it to the next pose on that way.
+    /// Where an arm is on its way to another branch, holds its slowest joints to the next pose on that way.
     fn walk(
         &mut self,
         target: &Target,
@@ -217,65 +223,88 @@ impl Solver<'_> {
         };
         self.minimise(target, &mut rival.angles, Effort::REFINE);
         let arm = &self.arms()[side];
-        let away = |joint: &usize| rival.angles[*joint] - memory.answer[*joint];
-        let frames = arm
-            .iter()
-            .map(|joint| away(joint).abs() / reach[*joint])
-            .fold(0.0, f64::max);
+        let frames = frames_between(&memory.answer, &rival.angles, arm, reach);
         if frames <= 1.0 {
             memory.rivals[side] = None;
             return;
         }
-        for joint in arm {
-            let next = memory.answer[*joint] + away(joint) / frames;
-            let next = next.clamp(lower[*joint], upper[*joint]);
-            (lower[*joint], upper[*joint]) = (next, next);
+        for &joint in arm {
+            let away = rival.angles[joint] - memory.answer[joint];
+            if away.abs() < FREE * frames * reach[joint] {
+                continue;
+            }
+            let next = memory.answer[joint] + away / frames;
+            let next = next.clamp(lower[joint], upper[joint]);
+            (lower[joint], upper[joint]) = (next, next);
         }
     }
 
-    /// Looks for a better way where an arm is far off, and starts to walk there once it has been better for long.
+    /// Looks for a better way where an arm is far off, and starts to walk there once staying has cost enough.
     fn look_around(
         &mut self,
         target: &Target,
         memory: &mut Memory,
         side: usize,
         objective: f64,
+        reach: &[f64],
         seconds: f64,
     ) {
-        if memory.rivals[side]
-            .as_ref()
-            .is_some_and(|rival| rival.walking)
-        {
-            return;
-        }
-        if objective < CONTENT {
-            memory.rivals[side] = None;
+        let is_walking = |rival: &Rival| rival.walking;
+        if memory.rivals[side].as_ref().is_some_and(is_walking) {
             return;
         }
         let known = memory.rivals[side].take();
-        let mut better_for = 0.0;
+        if objective < CONTENT {
+            return;
+        }
         let mut best = Best::new();
+        let regret = known.as_ref().map_or(0.0, |rival| rival.regret);
         if let Some(rival) = known {
             best.try_from(self, target, &rival.angles);
-            better_for = rival.better_for;
         } else {
+            best.try_from(self, target, &self.default_pose());
             for start in self.other_ways(&memory.answer, side) {
                 best.try_from(self, target, &start);
             }
-            best.try_from(self, target, &self.default_pose());
         }
         let (value, angles) = best.arms[side].clone();
         let is_another = self.arms()[side]
             .iter()
             .any(|joint| (angles[*joint] - memory.answer[*joint]).abs() > ANOTHER_WAY);
-        if value < objective - BETTER_BY && is_another {
-            let better_for = better_for + seconds;
-            memory.rivals[side] = Some(Rival {
-                angles,
-                better_for,
-                walking: better_for > PATIENCE,
-            });
+        if value > objective - BETTER_BY || !is_another {
+            return;
         }
+        let here = objective.sqrt();
+        let (on_the_way, frames) = self.way(target, &memory.answer, &angles, side, reach);
+        let cost = (on_the_way - here) * frames * seconds;
+        let regret = regret + (here - value.sqrt()) * seconds;
+        memory.rivals[side] = Some(Rival {
+            angles,
+            regret,
+            walking: regret > REGRET * cost,
+        });
+    }
+
+    /// The mean root of the arm's objective on the straight way between two answers, and how many frames that takes.
+    fn way(
+        &mut self,
+        target: &Target,
+        from: &[f64],
+        to: &[f64],
+        side: usize,
+        reach: &[f64],
+    ) -> (f64, f64) {
+        const SAMPLES: [f64; 3] = [0.25, 0.5, 0.75];
+        let arm = self.arms()[side].clone();
+        let mut between = from.to_vec();
+        let roots = SAMPLES.map(|share| {
+            for &joint in &arm {
+                between[joint] = from[joint] + share * (to[joint] - from[joint]);
+            }
+            self.arm_objectives(target, &between)[side].sqrt()
+        });
+        let mean = roots.iter().sum::<f64>() / SAMPLES.len() as f64;
+        (mean, frames_between(from, to, &arm, reach))
     }
 
     fn default_pose(&self) -> Vec<f64> {
@@ -289,30 +318,43 @@ impl Solver<'_> {
             return Vec::new();
         };
         let joints = self.robot().goal_joints();
-        let nearest = |joint: usize, ways: [f64; 2]| {
+        // Those inside the range, or else both at its ends: which of them is tried must not depend on the side.
+        let inside = |joint: usize, angles: [f64; 2]| -> Vec<f64> {
             let [lower, upper] = joints[joint].range;
-            let outside = |angle: f64| (lower - angle).max(angle - upper);
-            let [one, other] = ways;
-            let way = if outside(one) <= outside(other) {
-                one
+            let reached = angles.into_iter();
+            let reached: Vec<f64> = reached
+                .filter(|angle| (lower..=upper).contains(angle))
+                .collect();
+            if reached.is_empty() {
+                angles.map(|angle| angle.clamp(lower, upper)).to_vec()
             } else {
-                other
-            };
-            way.clamp(lower, upper)
+                reached
+            }
         };
-        let turned = |joint: usize| nearest(joint, [angles[joint] + PI, angles[joint] - PI]);
-        let mirrored = |joint: usize| nearest(joint, [PI - angles[joint], -PI - angles[joint]]);
-        let mut flipped = angles.to_vec();
-        flipped[first] = turned(first);
-        flipped[second] = mirrored(second);
-        flipped[third] = turned(third);
-        let mut twisted = angles.to_vec();
-        twisted[first] = turned(first);
-        twisted[third] = turned(third);
-        let mut only_first = angles.to_vec();
-        only_first[first] = turned(first);
-        vec![flipped, twisted, only_first]
+        let turned = |joint: usize| inside(joint, [angles[joint] + PI, angles[joint] - PI]);
+        let mirrored = inside(second, [PI - angles[second], -PI - angles[second]]);
+        let mut poses = Vec::new();
+        for first_angle in turned(first) {
+            for third_angle in turned(third) {
+                for &second_angle in mirrored.iter().chain([&angles[second]]) {
+                    let mut pose = angles.to_vec();
+                    pose[first] = first_angle;
+                    pose[second] = second_angle;
+                    pose[third] = third_angle;
+                    poses.push(pose);
+                }
+            }
+        }
+        poses
     }
+}
+
+/// How many frames an arm needs from one answer to another.
+fn frames_between(from: &[f64], to: &[f64], arm: &[usize], reach: &[f64]) -> f64 {
+    let frames = arm
+        .iter()
+        .map(|&joint| (to[joint] - from[joint]).abs() / reach[joint]);
+    frames.fold(0.0, f64::max)
 }
 
 /// The best answers so far, for each arm.

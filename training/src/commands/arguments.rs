@@ -4,11 +4,13 @@ use std::{
     path::{Path, PathBuf},
     process::ExitCode,
     sync::Arc,
+    time::Duration,
 };
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use emp_robot::Robot;
+use emp_training::run::RunFiles;
 
 /// Exit code of a command that was interrupted with its state saved.
 const INTERRUPTED: u8 = 3;
@@ -30,6 +32,44 @@ impl RobotArguments {
             format!("loading robot {}", self.robot)
         })?))
     }
+}
+
+#[derive(Args)]
+pub(super) struct RunArguments {
+    /// Continue the run from its checkpoint.
+    #[arg(long)]
+    pub(super) resume: bool,
+    /// Folder of the run's checkpoint and log [default: runs/COMMAND-ROBOT].
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+    /// Seconds between two checkpoints.
+    #[arg(long, default_value_t = 120)]
+    save_every: u64,
+    /// Threads for physics and learning; the weights do not depend on it.
+    #[arg(long, default_value_t = 2)]
+    pub(super) threads: usize,
+}
+
+impl RunArguments {
+    /// The folder of a run of `command` for `robot`.
+    pub(super) fn folder(&self, command: &str, robot: &Robot) -> PathBuf {
+        let default = || run_folder(command, robot);
+        self.run.clone().unwrap_or_else(default)
+    }
+
+    /// The run's files in `folder`.
+    pub(super) fn files(&self, folder: PathBuf, weights: PathBuf) -> RunFiles {
+        RunFiles {
+            folder,
+            weights,
+            save_every: Duration::from_secs(self.save_every),
+        }
+    }
+}
+
+/// Where a run of `command` for `robot` stands by default.
+pub(super) fn run_folder(command: &str, robot: &Robot) -> PathBuf {
+    PathBuf::from(format!("runs/{command}-{}", robot.name()))
 }
 
 /// The weights that were named, or the robot's shipped ones.

@@ -1,6 +1,6 @@
 //! `emp-train retargeter`.
 
-use std::{path::PathBuf, process::ExitCode, time::Duration};
+use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::{Result, ensure};
 use clap::Args;
@@ -10,10 +10,10 @@ use emp_training::{
         data::{self, Dataset},
         trainer::{self, RetargeterSettings, Trainer},
     },
-    run::{Interrupt, Outcome, RunFiles},
+    run::{Interrupt, Outcome},
 };
 
-use super::arguments::{RobotArguments, interrupted, refuse_overwriting};
+use super::arguments::{RobotArguments, RunArguments, interrupted, refuse_overwriting};
 
 /// What is trained, and on what.
 #[derive(Args)]
@@ -41,18 +41,8 @@ pub(crate) struct Arguments {
     /// Procedural clips in the mix.
     #[arg(long, default_value_t = 600)]
     procedural_clips: usize,
-    /// Continue the run from its checkpoint.
-    #[arg(long)]
-    resume: bool,
-    /// Folder of the run's checkpoint and log [default: runs/retargeter-ROBOT].
-    #[arg(long, value_name = "DIR")]
-    run: Option<PathBuf>,
-    /// Seconds between two checkpoints.
-    #[arg(long, default_value_t = 120)]
-    save_every: u64,
-    /// Threads for matrix products; the weights do not depend on it.
-    #[arg(long, default_value_t = 2)]
-    threads: usize,
+    #[command(flatten)]
+    run: RunArguments,
 }
 
 /// Trains a retargeter.
@@ -62,16 +52,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         "--batch and --steps must be at least 1"
     );
     let robot = arguments.robot.load()?;
-    let folder = arguments
-        .run
-        .clone()
-        .unwrap_or_else(|| PathBuf::from(format!("runs/retargeter-{}", robot.name())));
-    let save_every = Duration::from_secs(arguments.save_every);
-    let files = RunFiles {
-        folder,
-        weights: arguments.out.clone(),
-        save_every,
-    };
+    let folder = arguments.run.folder("retargeter", &robot);
+    let files = arguments.run.files(folder, arguments.out.clone());
     let settings = RetargeterSettings {
         steps: arguments.steps,
         batch: arguments.batch,
@@ -87,10 +69,10 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
         clips.len()
     );
 
-    linear::set_threads(arguments.threads);
+    linear::set_threads(arguments.run.threads);
     let checkpoint = files.checkpoint();
-    refuse_overwriting(&checkpoint, arguments.resume)?;
-    let mut trainer = if arguments.resume {
+    refuse_overwriting(&checkpoint, arguments.run.resume)?;
+    let mut trainer = if arguments.run.resume {
         Trainer::resume(robot, settings, &checkpoint)?
     } else {
         Trainer::new(robot, settings)?

@@ -4,7 +4,6 @@ use std::{
     path::{Path, PathBuf},
     process::ExitCode,
     sync::Arc,
-    time::Duration,
 };
 
 use anyhow::Result;
@@ -15,7 +14,7 @@ use emp_sim::{Pool, Priority};
 use emp_training::{
     emp::data::{self, Motions},
     equipment::Equipment,
-    run::{Interrupt, Outcome, RunFiles},
+    run::{Interrupt, Outcome},
     world_model::{
         settings::WorldModelSettings,
         trainer::{self, Trainer},
@@ -23,9 +22,12 @@ use emp_training::{
 };
 
 use super::arguments::{
-    RobotArguments, interrupted, learner_threads, policy_weights, refuse_overwriting,
+    RobotArguments, RunArguments, interrupted, learner_threads, policy_weights, refuse_overwriting,
     retargeter_weights,
 };
+
+/// The command, in the names of its runs.
+pub(super) const COMMAND: &str = "world-model";
 
 /// What is trained, and on what.
 #[derive(Args)]
@@ -62,35 +64,22 @@ pub(crate) struct Arguments {
     /// Seed of weights, episodes and procedural skills.
     #[arg(long, default_value_t = WorldModelSettings::default().seed)]
     seed: u64,
-    /// Continue the run from its checkpoint.
-    #[arg(long)]
-    resume: bool,
-    /// Folder of the run's checkpoint and log [default: runs/world-model-ROBOT].
-    #[arg(long, value_name = "DIR")]
-    run: Option<PathBuf>,
-    /// Seconds between two checkpoints.
-    #[arg(long, default_value_t = 120)]
-    save_every: u64,
-    /// Threads for physics and learning; the weights do not depend on it.
-    #[arg(long, default_value_t = 2)]
-    threads: usize,
+    #[command(flatten)]
+    run: RunArguments,
 }
 
 /// Trains a world model.
 pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     let robot = arguments.robot.load()?;
-    let folder = arguments.run.clone().unwrap_or_else(|| run_folder(&robot));
-    let files = RunFiles {
-        weights: arguments.out.clone().unwrap_or_else(|| model_file(&folder)),
-        folder,
-        save_every: Duration::from_secs(arguments.save_every),
-    };
+    let folder = arguments.run.folder(COMMAND, &robot);
+    let weights = arguments.out.clone().unwrap_or_else(|| model_file(&folder));
+    let files = arguments.run.files(folder, weights);
     let checkpoint = files.checkpoint();
-    refuse_overwriting(&checkpoint, arguments.resume)?;
+    refuse_overwriting(&checkpoint, arguments.run.resume)?;
     let settings = settings(arguments);
     settings.check()?;
     let (equipment, data) = equipment(arguments, robot, &settings)?;
-    let mut trainer = if arguments.resume {
+    let mut trainer = if arguments.run.resume {
         Trainer::resume(equipment, settings, &checkpoint)?
     } else {
         Trainer::new(equipment, settings)?
@@ -132,22 +121,19 @@ fn equipment(
         live: settings.live,
         frames: settings.episodes.episode_frames,
     };
-    let (clips, data) = data::clips(&retargeter, &motions, arguments.threads)?;
+    let (clips, data) = data::clips(&retargeter, &motions, arguments.run.threads)?;
     eprintln!("{} clips", clips.len());
     let equipment = Equipment {
         policy: Arc::new(Policy::load(&weights, Arc::clone(&robot))?),
-        pool: Arc::new(Pool::new(&robot, arguments.threads, Priority::Normal)?),
+        pool: Arc::new(Pool::new(&robot, arguments.run.threads, Priority::Normal)?),
         clips: clips.into(),
-        threads: Arc::new(learner_threads(arguments.threads)?),
+        threads: Arc::new(learner_threads(arguments.run.threads)?),
         robot,
     };
     Ok((equipment, data))
 }
 
-pub(super) fn run_folder(robot: &Robot) -> PathBuf {
-    PathBuf::from(format!("runs/world-model-{}", robot.name()))
-}
-
+/// The model in a run's folder.
 pub(super) fn model_file(folder: &Path) -> PathBuf {
     folder.join("model.safetensors")
 }

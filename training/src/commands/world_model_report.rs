@@ -9,9 +9,9 @@ use emp_sim::tracking::{TrackingEnvironments, TrackingSettings};
 use emp_training::world_model::accuracy;
 
 use super::{
-    arguments::{RobotArguments, learner_threads},
+    arguments::{RobotArguments, learner_threads, run_folder},
     trial::{TrialArguments, printed},
-    world_model::{model_file, run_folder},
+    world_model::{COMMAND, model_file},
 };
 
 /// What is measured, and on what.
@@ -39,7 +39,7 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode> {
     let (robot, trial) = (arguments.robot.load()?, &arguments.trial);
     let file = arguments.model.clone();
-    let file = file.unwrap_or_else(|| model_file(&run_folder(&robot)));
+    let file = file.unwrap_or_else(|| model_file(&run_folder(COMMAND, &robot)));
     let model = WorldModel::load(&file, &robot)?;
     let mut environments = TrackingEnvironments::new(
         Arc::clone(&robot),

@@ -1,8 +1,7 @@
 //! Whole clips at once, for training and evaluation: the answers of a stream, faster.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-
 use emp_motion::Clip;
+use rayon::prelude::*;
 
 use super::{Retargeter, Smoother, Solver, Target};
 use crate::ModelError;
@@ -28,30 +27,13 @@ pub fn retarget_clips(
     for clip in clips {
         check(clip)?;
     }
-    let next = AtomicUsize::new(0);
-    let work = || -> Vec<(usize, Result<GoalRows, ModelError>)> {
-        let mut answers = Vec::new();
-        while let Some((index, clip)) = {
-            let index = next.fetch_add(1, Ordering::Relaxed);
-            clips.get(index).map(|clip| (index, clip))
-        } {
-            answers.push((index, retarget_clip(retargeter, clip)));
-        }
-        answers
-    };
-    let mut answers: Vec<_> = std::thread::scope(|scope| {
-        let others: Vec<_> = (1..threads).map(|_| scope.spawn(work)).collect();
-        let mut answers = work();
-        for other in others {
-            match other.join() {
-                Ok(more) => answers.extend(more),
-                Err(panic) => std::panic::resume_unwind(panic),
-            }
-        }
-        answers
-    });
-    answers.sort_unstable_by_key(|(index, _)| *index);
-    answers.into_iter().map(|(_, answer)| answer).collect()
+    let threads = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1));
+    let threads = threads.build().map_err(candle_core::Error::wrap)?;
+    threads.install(|| {
+        // Clips differ in length: each thread takes one at a time.
+        let clips = clips.par_iter().with_max_len(1);
+        clips.map(|clip| retarget_clip(retargeter, clip)).collect()
+    })
 }
 
 /// The network's own answers to a clip of any frame rate, at the robot's control rate: what a live stream without refinement

@@ -12,7 +12,10 @@ use emp_sim::{
 };
 use serde::Serialize;
 
-use super::{Candidate, EmpRun, HARD, Outcome, Part, Played, evaluation};
+use super::{
+    play::{Candidate, EmpRun, Part, Played, evaluation},
+    rows::{HARD, Outcome},
+};
 
 /// Shares of safe frames that a gate lets pass.
 const PERCENTILES: [f64; 3] = [0.5, 0.9, 0.99];

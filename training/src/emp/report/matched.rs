@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::{Outcome, Row};
+use super::rows::{Outcome, Row};
 
 /// What is taken from the goals.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

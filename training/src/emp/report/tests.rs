@@ -3,7 +3,7 @@ use std::path::Path;
 use candle_core::{DType, Device};
 use candle_nn::{VarBuilder, VarMap};
 use emp_models::{
-    controller::ControllerOutput,
+    controller::{Controller, ControllerOutput},
     emp::{DangerGate, EmpConfig, EmpNetwork, Output},
     filters::Risk,
     mlp::Normalizer,
@@ -12,11 +12,17 @@ use emp_models::{
 use emp_robot::Robot;
 use emp_sim::{
     Priority, Reading,
-    evaluation::ExecutedFrame,
+    evaluation::{ExecutedFrame, Observer as _},
     goals::{GoalClip, Source},
 };
 
+use std::sync::Arc;
+
+use emp_models::{emp::Emp, policy::Policy};
+use emp_sim::{Pool, metrics::Interval};
+
 use super::*;
+use crate::sets::{ClipGroup, MotionSet};
 
 fn root() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."))

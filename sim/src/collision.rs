@@ -172,11 +172,7 @@ mod tests {
     fn physics_reports_the_contact_that_geometry_sees() {
         for_each_robot(|robot| {
             let goal = pressed(robot);
-            let legs: Vec<f32> = robot
-                .leg_joints()
-                .iter()
-                .map(|joint| joint.default as f32)
-                .collect();
+            let legs: Vec<f32> = robot.default_legs();
             let angles: Vec<f64> = goal.iter().chain(&legs).map(|&a| f64::from(a)).collect();
             let mut stage = Stage::new(robot).unwrap();
             let mut body = stage.place(&Start {

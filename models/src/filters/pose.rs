@@ -14,10 +14,9 @@ impl AmplitudeCut {
     pub(super) fn new(parameters: &mut Parameters<'_>, robot: &Robot) -> Result<Self, FilterError> {
         let factor = parameters.number("factor", 0.0..=1.0, "")?;
         parameters.finish("factor or joints")?;
-        let joints = robot.goal_joints().iter();
         Ok(Self {
             factor: factor.unwrap_or(0.9) as f32,
-            default: joints.map(|joint| joint.default as f32).collect(),
+            default: robot.default_goal(),
         })
     }
 }

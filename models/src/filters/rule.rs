@@ -1,5 +1,7 @@
 //! Filters that need no learning: a fixed rule for one robot's goal.
 
+use std::sync::Arc;
+
 use emp_robot::Robot;
 
 use super::goal_filter::{FilterItem, GoalFilter};
@@ -47,19 +49,16 @@ impl Rule for SomeJoints {
 pub(super) struct RuleFilter {
     specification: String,
     rules: Vec<Box<dyn Rule>>,
-    ranges: Vec<[f32; 2]>,
+    robot: Arc<Robot>,
 }
 
 impl RuleFilter {
     /// `rules` for `robot`, as `specification` asks for them.
-    pub(super) fn new(specification: &str, rules: Vec<Box<dyn Rule>>, robot: &Robot) -> Self {
-        let ranges = robot.goal_joints().iter();
+    pub(super) fn new(specification: &str, rules: Vec<Box<dyn Rule>>, robot: &Arc<Robot>) -> Self {
         Self {
             specification: specification.trim().to_owned(),
             rules,
-            ranges: ranges
-                .map(|joint| joint.range.map(|limit| limit as f32))
-                .collect(),
+            robot: Arc::clone(robot),
         }
     }
 
@@ -92,9 +91,7 @@ impl GoalFilter for RuleFilter {
     fn filter(&self, batch: &mut [FilterItem<'_>]) -> Result<(), ModelError> {
         for item in batch {
             self.apply(item);
-            for (angle, range) in item.goal.iter_mut().zip(&self.ranges) {
-                *angle = angle.clamp(range[0], range[1]);
-            }
+            self.robot.clamp_goal(item.goal);
         }
         Ok(())
     }

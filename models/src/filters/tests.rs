@@ -33,8 +33,7 @@ fn refused(specification: &str) -> String {
 }
 
 fn rest(robot: &Robot) -> Vec<f32> {
-    let joints = robot.goal_joints().iter();
-    joints.map(|joint| joint.default as f32).collect()
+    robot.default_goal()
 }
 
 /// A pose at a share (0..1, one a joint) of each goal joint's range.

@@ -16,7 +16,7 @@ use crate::pushes::{PushClock, Pushes};
 use crate::{Body, Stage, Targets};
 
 /// What all episodes of an evaluation share.
-pub(super) struct Setting {
+pub(super) struct EvaluationContext {
     pub(super) kind: Kind,
     pub(super) seed: u64,
     pub(super) randomization: Randomization,
@@ -75,22 +75,22 @@ pub(super) struct Episode<'a> {
 impl<'a> Episode<'a> {
     /// The robot at rest with its upper body at `start` (rad), as [`Kind::begin`] says.
     pub(super) fn new(
-        setting: &Setting,
+        context: &EvaluationContext,
         number: usize,
         clip: &'a GoalClip,
         start: &[f32],
         state: ControllerState,
         stage: &mut Stage,
     ) -> Self {
-        let mut rng = ChaCha8Rng::seed_from_u64(setting.seed);
+        let mut rng = ChaCha8Rng::seed_from_u64(context.seed);
         rng.set_stream(number as u64);
-        let ranges = &setting.randomization;
+        let ranges = &context.randomization;
         let setup = EpisodeSetup {
-            parameters: setting.kind.draw(ranges, &mut rng),
+            parameters: context.kind.draw(ranges, &mut rng),
             ranges,
-            pushes: setting.pushes,
+            pushes: context.pushes,
         };
-        let (body, pushes) = setting.kind.begin(stage, start, setup, &mut rng);
+        let (body, pushes) = context.kind.begin(stage, start, setup, &mut rng);
         Self {
             number,
             clip,
@@ -98,7 +98,7 @@ impl<'a> Episode<'a> {
             pushes,
             rng,
             state,
-            legs: vec![0.0; setting.kind.leg_default.len()],
+            legs: vec![0.0; context.kind.leg_default.len()],
             executed: 0,
             outcome: None,
             sums: EpisodeSums::default(),
@@ -128,12 +128,17 @@ impl<'a> Episode<'a> {
     }
 
     /// One control period with the controller's answer.
-    pub(super) fn step(&mut self, setting: &Setting, stage: &mut Stage, output: &ControllerOutput) {
+    pub(super) fn step(
+        &mut self,
+        context: &EvaluationContext,
+        stage: &mut Stage,
+        output: &ControllerOutput,
+    ) {
         self.pushes
-            .tick(&setting.kind.robot, &mut self.body, &mut self.rng);
-        match setting.randomization.action {
+            .tick(&context.kind.robot, &mut self.body, &mut self.rng);
+        match context.randomization.action {
             Some(noise) => leg_targets(
-                &setting.kind.robot,
+                &context.kind.robot,
                 &output.action,
                 Some(noise),
                 &mut self.rng,
@@ -149,13 +154,13 @@ impl<'a> Episode<'a> {
             legs: &self.legs,
         };
         let reading = stage.step(&mut self.body, &targets);
-        let fall = setting.limits.fall(reading, setting.kind.standing_height);
+        let fall = context.limits.fall(reading, context.kind.standing_height);
         if reading.divergence.is_none() {
             self.sums.add(&Frame {
                 reading,
                 goal: asked,
                 executed: &output.goal,
-                default: &setting.default,
+                default: &context.default,
                 speeds_before: &speeds_before,
             });
         }

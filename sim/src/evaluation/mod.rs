@@ -27,7 +27,7 @@ use crate::environment::{EnvironmentConfig, Kind};
 use crate::goals::{GoalClip, GoalStatistics, Source};
 use crate::metrics::{self, Interval, Metrics, Sample};
 use crate::{Pool, SimError};
-use episode::{Episode, Setting};
+use episode::{Episode, EvaluationContext};
 
 /// Episodes that share a batch of the controller. An episode that is over keeps its row until all are.
 const GROUP: usize = 64;
@@ -191,7 +191,7 @@ pub fn evaluate_observed(
         pool,
         controller,
         clips: &clips,
-        setting: Setting {
+        context: EvaluationContext {
             kind: Kind::new(Arc::clone(robot)),
             seed: settings.seed,
             pushes: settings.pushes(&randomization),
@@ -246,7 +246,7 @@ struct Runner<'a> {
     controller: &'a Controller,
     /// The clips as they are played.
     clips: &'a [GoalClip],
-    setting: Setting,
+    context: EvaluationContext,
 }
 
 impl<'a> Runner<'a> {
@@ -276,7 +276,7 @@ impl<'a> Runner<'a> {
             let pairs = episodes.par_iter_mut().zip(&outputs);
             self.pool.for_each(pairs, |stage, (episode, output)| {
                 if !episode.is_over() {
-                    episode.step(&self.setting, stage, output);
+                    episode.step(&self.context, stage, output);
                 }
             });
             for ((episode, output), was_over) in episodes.iter().zip(&outputs).zip(was_over) {
@@ -303,8 +303,8 @@ impl<'a> Runner<'a> {
         self.pool.for_each(places, |stage, (index, (slot, start))| {
             let number = group.start + index;
             let (clip, state) = (self.clip(number), self.controller.state());
-            let setting = &self.setting;
-            *slot = Some(Episode::new(setting, number, clip, start, state, stage));
+            let context = &self.context;
+            *slot = Some(Episode::new(context, number, clip, start, state, stage));
         });
         Ok(slots.into_iter().flatten().collect())
     }
@@ -318,13 +318,13 @@ impl<'a> Runner<'a> {
         Scores {
             episodes: chosen.len(),
             motions: metrics::motions(&samples),
-            metrics: metrics::summary(&samples, self.setting.seed),
-            goals: GoalStatistics::of(&self.setting.kind.robot, clips),
+            metrics: metrics::summary(&samples, self.context.seed),
+            goals: GoalStatistics::of(&self.context.kind.robot, clips),
         }
     }
 
     fn failures(&self, results: &[EpisodeResult]) -> Vec<Failure> {
-        let rate = self.setting.kind.robot.control_rate_hz();
+        let rate = self.context.kind.robot.control_rate_hz();
         let failure = |result: &EpisodeResult| {
             Some(Failure {
                 episode: result.episode,

@@ -217,9 +217,7 @@ impl GoalClip {
 
     fn clamp(&mut self, robot: &Robot) {
         for frame in self.angles.chunks_exact_mut(self.joints) {
-            for (angle, joint) in frame.iter_mut().zip(robot.goal_joints()) {
-                *angle = angle.clamp(joint.range[0] as f32, joint.range[1] as f32);
-            }
+            robot.clamp_goal(frame);
         }
     }
 }

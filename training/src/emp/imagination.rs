@@ -155,7 +155,7 @@ mod tests {
     use crate::{
         emp::{
             losses::{LossSettings, LossWeights},
-            objective::{Moments, Objective},
+            objective::{Objective, StateBatch},
         },
         variables,
     };
@@ -353,7 +353,7 @@ mod tests {
     struct Case {
         imagination: Imagination,
         objective: Objective,
-        moments: Moments,
+        states: StateBatch,
     }
 
     impl Case {
@@ -362,7 +362,7 @@ mod tests {
             Self {
                 imagination: imagination(),
                 objective: Objective::new(&robot(), layout(), settings).unwrap(),
-                moments: Moments {
+                states: StateBatch {
                     stacks: stacks(),
                     goals_ahead: (1..horizon).map(|t| goals(t as f64)).collect(),
                     goals_before: [goals(-2.0), goals(-1.0)],
@@ -372,7 +372,7 @@ mod tests {
 
         fn loss(&self, emp: &EmpNetwork, weights: &LossWeights) -> Tensor {
             let double = |tensor: &Tensor| tensor.to_dtype(DType::F64).unwrap();
-            let (stacks, ahead) = (&self.moments.stacks, &self.moments.goals_ahead);
+            let (stacks, ahead) = (&self.states.stacks, &self.states.goals_ahead);
             let steps = self.imagination.unroll(emp, stacks, ahead).unwrap();
             let steps: Vec<ImaginedStep> = steps
                 .iter()
@@ -383,12 +383,12 @@ mod tests {
                     orientation: double(&step.orientation),
                 })
                 .collect();
-            let moments = Moments {
+            let states = StateBatch {
                 stacks: double(stacks),
                 goals_ahead: ahead.iter().map(double).collect(),
-                goals_before: self.moments.goals_before.each_ref().map(double),
+                goals_before: self.states.goals_before.each_ref().map(double),
             };
-            let terms = self.objective.terms(&moments, &steps).unwrap();
+            let terms = self.objective.terms(&states, &steps).unwrap();
             terms.total(weights).unwrap()
         }
     }

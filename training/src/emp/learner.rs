@@ -27,7 +27,7 @@ use super::{
     hindsight::{Label, Labels},
     imagination::{Imagination, ImaginedStep},
     memory::Memory,
-    objective::{Moments, Objective},
+    objective::{Objective, StateBatch},
     rollout::EmpRollout,
     settings::EmpSettings,
 };
@@ -301,15 +301,15 @@ impl Learner {
         let (rows, rollout) = (&part.rows, source.rollout);
         let share = rows.len() as f64 / whole.rows.len() as f64;
         let stacks = gather(&rollout.stacks, self.layout.width(), rows);
-        let moments = self.moments(rollout, rows)?;
+        let states = self.states(rollout, rows)?;
         let steps = match source.imagination {
             Some(imagination) => {
                 let stacks = tensor(&stacks, self.layout.width())?;
-                imagination.unroll(&self.network, &stacks, &moments.goals_ahead)?
+                imagination.unroll(&self.network, &stacks, &states.goals_ahead)?
             }
             None => vec![self.unimagined(&stacks)?],
         };
-        let mut terms = self.objective.terms(&moments, &steps)?;
+        let mut terms = self.objective.terms(&states, &steps)?;
         if let Some(labels) = source.labels {
             let right = labelled(labels, rows, Label::Right)?.repeat(steps.len())?;
             terms.reconstruction = (&terms.reconstruction * right)?;
@@ -335,7 +335,7 @@ impl Learner {
     }
 
     /// What the losses look at. The smoothness loss looks back at answers, not at what was executed of them.
-    fn moments(&self, rollout: &EmpRollout, rows: &[usize]) -> Result<Moments> {
+    fn states(&self, rollout: &EmpRollout, rows: &[usize]) -> Result<StateBatch> {
         let layout = &self.layout;
         let joints = layout.goal().len();
         let mut stacks = gather(&rollout.stacks, layout.width(), rows);
@@ -355,7 +355,7 @@ impl Learner {
             gathered(&rollout.goals, joints, &rows)
         });
         let [before_that, before] = &rollout.goals_before;
-        Ok(Moments {
+        Ok(StateBatch {
             stacks: Tensor::from_vec(stacks, (rows.len(), layout.width()), &Device::Cpu)?,
             goals_ahead: ahead.collect::<candle_core::Result<_>>()?,
             goals_before: [

@@ -14,9 +14,9 @@ use super::{
 /// Past goals that the smoothness loss reads.
 const PAST: usize = 2;
 
-/// The moments from which a batch imagines, one a row.
+/// States from which is imagined, one a row.
 #[derive(Clone, Debug)]
-pub struct Moments {
+pub struct StateBatch {
     /// Stacks `S_t` (N × [`ObservationLayout::width`]): the newest frame holds the goal that was asked for, older ones what
     /// was executed.
     pub stacks: Tensor,
@@ -169,12 +169,12 @@ impl Objective {
         Ok([mean[0], mean[1]])
     }
 
-    /// The terms of what was imagined from `moments`. All steps' kinematics are one call.
+    /// The terms of what was imagined from `states`. All steps' kinematics are one call.
     ///
     /// # Errors
-    /// When the number of steps is not that of the moments' goals, or shapes do not fit.
-    pub fn terms(&self, moments: &Moments, steps: &[ImaginedStep]) -> candle_core::Result<Terms> {
-        let horizon = 1 + moments.goals_ahead.len();
+    /// When the number of steps is not that of the states' goals, or shapes do not fit.
+    pub fn terms(&self, states: &StateBatch, steps: &[ImaginedStep]) -> candle_core::Result<Terms> {
+        let horizon = 1 + states.goals_ahead.len();
         if steps.len() != horizon {
             bail!("{} imagined steps, expected {horizon}", steps.len());
         }
@@ -182,14 +182,14 @@ impl Objective {
             Tensor::cat(&steps.iter().map(part).collect::<Vec<_>>(), 0)
         };
         let executed = all(|step| &step.goal)?;
-        let goals = self.goals(moments)?;
-        let [orientation, collision, centroid] = self.body(moments, &all, &executed, horizon)?;
+        let goals = self.goals(states)?;
+        let [orientation, collision, centroid] = self.body(states, &all, &executed, horizon)?;
         Ok(Terms {
             reconstruction: losses::reconstruction(&goals, &executed, self.settings.distance)?,
             orientation,
             collision,
             centroid,
-            smoothness: self.smoothness(moments, &goals, &executed)?,
+            smoothness: self.smoothness(states, &goals, &executed)?,
             regularization: losses::regularization(&all(|step| &step.latent)?)?,
         })
     }
@@ -197,7 +197,7 @@ impl Objective {
     /// `L_ori`, `L_col` and `L_cen`, those that have a weight.
     fn body(
         &self,
-        moments: &Moments,
+        states: &StateBatch,
         all: &dyn Fn(fn(&ImaginedStep) -> &Tensor) -> candle_core::Result<Tensor>,
         executed: &Tensor,
         horizon: usize,
@@ -213,7 +213,7 @@ impl Objective {
         let posture = match self.settings.cen_on {
             CenOn::Predicted => all(|step| &step.joint_positions)?,
             CenOn::QuasiStatic => {
-                let legs = self.legs(&moments.stacks)?.repeat((horizon, 1))?;
+                let legs = self.legs(&states.stacks)?.repeat((horizon, 1))?;
                 Tensor::cat(&[executed, &legs], 1)?
             }
         };
@@ -230,26 +230,26 @@ impl Objective {
     }
 
     /// The goals that were asked for, step by step.
-    fn goals(&self, moments: &Moments) -> candle_core::Result<Tensor> {
-        let first = self.past(&moments.stacks, 0, self.observation.goal())?;
-        let goals: Vec<&Tensor> = [&first].into_iter().chain(&moments.goals_ahead).collect();
+    fn goals(&self, states: &StateBatch) -> candle_core::Result<Tensor> {
+        let first = self.past(&states.stacks, 0, self.observation.goal())?;
+        let goals: Vec<&Tensor> = [&first].into_iter().chain(&states.goals_ahead).collect();
         Tensor::cat(&goals, 0)
     }
 
     /// `L_smo` of all steps: the first two look back at what was executed before.
     fn smoothness(
         &self,
-        moments: &Moments,
+        states: &StateBatch,
         goals: &Tensor,
         executed: &Tensor,
     ) -> candle_core::Result<Tensor> {
         let goal = self.observation.goal();
-        let before = [2, 1].map(|periods| self.past(&moments.stacks, periods, goal.clone()));
+        let before = [2, 1].map(|periods| self.past(&states.stacks, periods, goal.clone()));
         let [before_that, before] = before;
         let (before_that, before) = (before_that?, before?);
         let mut track = Tensor::cat(&[&before_that, &before, executed], 0)?;
         if self.settings.smooth_on == SmoothOn::Correction {
-            let [before_that, before] = &moments.goals_before;
+            let [before_that, before] = &states.goals_before;
             track = (track - Tensor::cat(&[before_that, before, goals], 0)?)?;
         }
         let (rows, all) = (before.dim(0)?, executed.dim(0)?);
@@ -353,12 +353,12 @@ mod tests {
     }
 
     /// Two steps from stacks of three frames near the default pose.
-    fn moments() -> Moments {
+    fn states() -> StateBatch {
         let layout = layout();
         let mut frame = vec![0.0; layout.frame_width()];
         frame[layout.joint_positions()].copy_from_slice(&defaults());
         frame[layout.goal()].copy_from_slice(&defaults()[..layout.goal().len()]);
-        Moments {
+        StateBatch {
             stacks: scattered(&frame.repeat(layout.history()), 0.05, 1.0),
             goals_ahead: vec![goals(2.0)],
             goals_before: [goals(3.0), goals(4.0)],
@@ -420,7 +420,7 @@ mod tests {
         ] {
             let mut objective = objective(smooth_on, cen_on);
             objective.set_reference([0.035, -0.01]);
-            let moments = moments();
+            let states = states();
             let total = |parts: &[Tensor]| {
                 let steps: Vec<ImaginedStep> = parts
                     .chunks(4)
@@ -431,7 +431,7 @@ mod tests {
                         orientation: parts[3].clone(),
                     })
                     .collect();
-                let terms = objective.terms(&moments, &steps).unwrap();
+                let terms = objective.terms(&states, &steps).unwrap();
                 terms.total(&LossWeights::default()).unwrap()
             };
             let steps = [step(5.0), step(9.0)];
@@ -466,21 +466,21 @@ mod tests {
 
     #[test]
     fn smoothness_looks_back_at_what_was_executed_before() {
-        let (layout, moments) = (layout(), moments());
+        let (layout, states) = (layout(), states());
         let steps = [step(5.0), step(9.0)];
         let (mut on_target, mut on_correction) = (Vec::new(), Vec::new());
         for t in 0..steps.len() {
             for r in 0..ROWS {
-                let stack = row(&moments.stacks, r);
+                let stack = row(&states.stacks, r);
                 let frames: Vec<&[f64]> = stack.chunks(layout.frame_width()).collect();
                 let goal = |frame: usize| frames[frame][layout.goal()].to_vec();
                 let [first, second] = [&steps[0], &steps[1]].map(|step| row(&step.goal, r));
                 let executed = [goal(0), goal(1), first, second];
                 let asked = [
-                    row(&moments.goals_before[0], r),
-                    row(&moments.goals_before[1], r),
+                    row(&states.goals_before[0], r),
+                    row(&states.goals_before[1], r),
                     goal(2),
-                    row(&moments.goals_ahead[0], r),
+                    row(&states.goals_ahead[0], r),
                 ];
                 let changes: Vec<Vec<f64>> =
                     (0..4).map(|i| minus(&executed[i], &asked[i])).collect();
@@ -493,23 +493,23 @@ mod tests {
             (SmoothOn::Correction, on_correction),
         ] {
             let objective = objective(smooth_on, CenOn::Predicted);
-            let terms = objective.terms(&moments, &steps).unwrap();
+            let terms = objective.terms(&states, &steps).unwrap();
             assert_near(&values(&terms.smoothness), &expected);
         }
     }
 
     #[test]
     fn collision_and_centroid_judge_the_posture_of_the_setting() {
-        let (robot, layout, moments) = (robot(), layout(), moments());
+        let (robot, layout, states) = (robot(), layout(), states());
         let steps = [step(5.0), step(9.0)];
         let goals = layout.goal().len();
         for cen_on in [CenOn::Predicted, CenOn::QuasiStatic] {
             let objective = objective(SmoothOn::Target, cen_on);
-            let terms = objective.terms(&moments, &steps).unwrap();
+            let terms = objective.terms(&states, &steps).unwrap();
             let (mut collisions, mut centroids) = (Vec::new(), Vec::new());
             for step in &steps {
                 for r in 0..ROWS {
-                    let stack = row(&moments.stacks, r);
+                    let stack = row(&states.stacks, r);
                     let newest = &stack[layout.newest()][layout.joint_positions()];
                     let angles = row(&step.orientation, r);
                     let (posture, base) = match cen_on {
@@ -545,8 +545,8 @@ mod tests {
     fn at_the_operating_point_the_centroid_costs_least() {
         for cen_on in [CenOn::Predicted, CenOn::QuasiStatic] {
             let mut objective = objective(SmoothOn::Target, cen_on);
-            let (layout, moments) = (layout(), moments());
-            let newest = moments
+            let (layout, states) = (layout(), states());
+            let newest = states
                 .stacks
                 .narrow(1, layout.newest().start, layout.frame_width());
             let newest = newest.unwrap().narrow(0, 0, 1).unwrap();
@@ -557,25 +557,25 @@ mod tests {
                 joint_positions: part(layout.joint_positions()),
                 orientation: part(layout.orientation()),
             };
-            let moments = Moments {
-                stacks: moments.stacks.narrow(0, 0, 1).unwrap(),
+            let states = StateBatch {
+                stacks: states.stacks.narrow(0, 0, 1).unwrap(),
                 goals_ahead: Vec::new(),
-                goals_before: moments
+                goals_before: states
                     .goals_before
                     .map(|goals| goals.narrow(0, 0, 1).unwrap()),
             };
             let cost = |objective: &Objective| {
                 let terms = objective
-                    .terms(&moments, std::slice::from_ref(&step))
+                    .terms(&states, std::slice::from_ref(&step))
                     .unwrap();
                 values(terms.centroid.as_ref().unwrap())[0]
             };
             let least = (-0.21_f64).exp() - 1.0;
             assert!(cost(&objective) > least + 0.01);
-            let reference = objective.operating_point(&moments.stacks).unwrap();
+            let reference = objective.operating_point(&states.stacks).unwrap();
             objective.set_reference(reference);
             assert!((cost(&objective) - least).abs() < 1e-4);
-            let mean = [moments.stacks.clone(), moments.stacks.clone()];
+            let mean = [states.stacks.clone(), states.stacks.clone()];
             let mean = objective
                 .operating_point(&Tensor::cat(&mean, 0).unwrap())
                 .unwrap();
@@ -586,9 +586,7 @@ mod tests {
     #[test]
     fn the_total_is_the_weighted_sum_of_the_means() {
         let objective = objective(SmoothOn::Target, CenOn::Predicted);
-        let terms = objective
-            .terms(&moments(), &[step(5.0), step(9.0)])
-            .unwrap();
+        let terms = objective.terms(&states(), &[step(5.0), step(9.0)]).unwrap();
         let [rec, ori, col, cen, smo, reg] = terms.means().unwrap();
         let expected = 20.0 * rec + 10.0 * ori + col + 10.0 * cen + 100.0 * smo + reg;
         let total = terms.total(&LossWeights::default()).unwrap();
@@ -601,11 +599,11 @@ mod tests {
     fn a_term_without_weight_is_not_computed() {
         let mut objective = objective(SmoothOn::Target, CenOn::Predicted);
         let steps = [step(5.0), step(9.0)];
-        let all = objective.terms(&moments(), &steps).unwrap();
+        let all = objective.terms(&states(), &steps).unwrap();
         let weights = &mut objective.settings.weights;
         (weights.orientation, weights.collision, weights.centroid) = (0.0, 0.0, 0.0);
         let weights = *weights;
-        let some = objective.terms(&moments(), &steps).unwrap();
+        let some = objective.terms(&states(), &steps).unwrap();
         assert!(some.orientation.is_none() && some.collision.is_none() && some.centroid.is_none());
         let means = some.means().unwrap();
         let is_computed = means.map(f64::is_finite);
@@ -613,14 +611,14 @@ mod tests {
         let [ours, theirs] = [some, all].map(|terms| values(&terms.total(&weights).unwrap()));
         assert_near(&ours, &theirs);
         objective.settings.weights.centroid = 1.0;
-        let balanced = objective.terms(&moments(), &steps).unwrap();
+        let balanced = objective.terms(&states(), &steps).unwrap();
         assert!(balanced.centroid.is_some() && balanced.collision.is_none());
     }
 
     #[test]
     fn misfits_are_errors() {
         let objective = objective(SmoothOn::Target, CenOn::Predicted);
-        let error = objective.terms(&moments(), &[step(5.0)]).err().unwrap();
+        let error = objective.terms(&states(), &[step(5.0)]).err().unwrap();
         assert!(error.to_string().contains("expected 2"), "{error}");
         let short = ObservationLayout::new(&robot(), 2);
         let error = Objective::new(&robot(), short, LossSettings::default());

@@ -294,15 +294,15 @@ fn falls(traced: &[Traced], nominal: &OperatingPoint, rate: f64, seed: u64) -> F
     let before = traced.iter().flat_map(|one| one.before_falls(widest));
     let ever = traced.iter().flat_map(|one| one.episodes.iter().flatten());
     let standing = traced.iter().flat_map(Traced::standing);
-    let tilted = quantile_of(standing.clone().map(|moment| moment.tilt).collect(), TILTED);
+    let tilted = quantile_of(standing.clone().map(|frame| frame.tilt).collect(), TILTED);
     Falls {
         conditions: traced.iter().map(|one| one.condition.name()).collect(),
         episodes: raw.len(),
         falls: failures(&raw),
         directions: Directions::of(ends.clone()),
         mirrored: traced.iter().map(|one| one.mirrored).sum(),
-        reach_before: Reaches::shares(before.map(|moment| moment.reach)),
-        reach_ever: Reaches::shares(ever.map(|moment| moment.reach)),
+        reach_before: Reaches::shares(before.map(|frame| frame.reach)),
+        reach_ever: Reaches::shares(ever.map(|frame| frame.reach)),
         standing: OperatingPoint::of(standing),
         seconds_from_tilt: tilted
             .and_then(|tilted| frames_from_tilt(ends, tilted))
@@ -310,7 +310,7 @@ fn falls(traced: &[Traced], nominal: &OperatingPoint, rate: f64, seed: u64) -> F
         tilted,
         signals: SIGNALS
             .iter()
-            .filter_map(|(name, value)| signal(name, traced, |moment| value(moment, nominal)))
+            .filter_map(|(name, value)| signal(name, traced, |frame| value(frame, nominal)))
             .collect(),
         cuts: cut_falls(traced, &raw, seed),
     }
@@ -320,7 +320,7 @@ fn falls(traced: &[Traced], nominal: &OperatingPoint, rate: f64, seed: u64) -> F
 fn frames_from_tilt<'a>(ends: impl Iterator<Item = &'a [TracedFrame]>, tilted: f64) -> Option<f64> {
     let tilting = |frames: &[TracedFrame]| {
         let last = frames.iter().rev();
-        last.take_while(|moment| moment.tilt > tilted).count() as f64
+        last.take_while(|frame| frame.tilt > tilted).count() as f64
     };
     quantile_of(ends.map(tilting).collect(), 0.5)
 }
@@ -375,8 +375,8 @@ impl Sum for Directions {
 impl OperatingPoint {
     /// Of frames in which the robot stands; none of none.
     fn of<'a>(standing: impl Iterator<Item = &'a TracedFrame> + Clone) -> Option<Self> {
-        let measured = spread(standing.clone().map(|moment| moment.measured_com))?;
-        let quasi_static = spread(standing.map(|moment| moment.static_com))?;
+        let measured = spread(standing.clone().map(|frame| frame.measured_com))?;
+        let quasi_static = spread(standing.map(|frame| frame.static_com))?;
         Some(Self {
             measured: measured[0],
             measured_deviation: measured[1],
@@ -406,36 +406,33 @@ type Value = fn(&TracedFrame, &OperatingPoint) -> Option<f64>;
 
 /// Names of signs of falls, and their values.
 const SIGNALS: [(&str, Value); 10] = [
-    (
-        "static CoM: distance from the feet's middle",
-        |moment, _| Some(moment.static_com.norm()),
-    ),
+    ("static CoM: distance from the feet's middle", |frame, _| {
+        Some(frame.static_com.norm())
+    }),
     (
         "static CoM: distance from its usual place",
-        |moment, usual| Some((moment.static_com - Vector2::from(usual.quasi_static)).norm()),
+        |frame, usual| Some((frame.static_com - Vector2::from(usual.quasi_static)).norm()),
     ),
-    ("static CoM: backward", |moment, _| {
-        Some(-moment.static_com.x)
-    }),
-    ("static CoM: to the right", |moment, _| {
-        Some(-moment.static_com.y)
+    ("static CoM: backward", |frame, _| Some(-frame.static_com.x)),
+    ("static CoM: to the right", |frame, _| {
+        Some(-frame.static_com.y)
     }),
     (
         "measured CoM: distance from the feet's middle",
-        |moment, _| Some(moment.measured_com.norm()),
+        |frame, _| Some(frame.measured_com.norm()),
     ),
     (
         "measured CoM: distance from its usual place",
-        |moment, usual| Some((moment.measured_com - Vector2::from(usual.measured)).norm()),
+        |frame, usual| Some((frame.measured_com - Vector2::from(usual.measured)).norm()),
     ),
-    ("measured CoM: backward", |moment, _| {
-        Some(-moment.measured_com.x)
+    ("measured CoM: backward", |frame, _| {
+        Some(-frame.measured_com.x)
     }),
-    ("measured CoM: to the right", |moment, _| {
-        Some(-moment.measured_com.y)
+    ("measured CoM: to the right", |frame, _| {
+        Some(-frame.measured_com.y)
     }),
-    ("tilt", |moment, _| Some(moment.tilt)),
-    ("regloss", |moment, _| moment.regloss),
+    ("tilt", |frame, _| Some(frame.tilt)),
+    ("regloss", |frame, _| frame.regloss),
 ];
 
 /// A sign's areas, each condition by itself and then averaged; none where the value is not known.

@@ -72,7 +72,7 @@ impl Tracer {
 impl Observer for Tracer {
     fn executed(&mut self, frame: &ExecutedFrame<'_>) {
         let gravity = projected_gravity(&frame.reading.orientation);
-        let moment = TracedFrame {
+        let traced = TracedFrame {
             static_com: self.static_com(&frame.output.goal),
             measured_com: frame.reading.center_of_mass_over_feet(),
             tilt: tilt(&frame.reading.orientation),
@@ -83,6 +83,6 @@ impl Observer for Tracer {
         if self.episodes.len() <= frame.episode {
             self.episodes.resize(frame.episode + 1, Vec::new());
         }
-        self.episodes[frame.episode].push(moment);
+        self.episodes[frame.episode].push(traced);
     }
 }

@@ -189,7 +189,7 @@ impl ServiceError {
         };
         pairs
             .into_iter()
-            .map(|(key, value)| (key.to_owned(), value))
+            .map(|(key, value)| (key.to_owned(), shortened(&value)))
             .collect()
     }
 
@@ -197,7 +197,8 @@ impl ServiceError {
         let mut details = ErrorDetails::with_error_info(self.reason(), DOMAIN, self.metadata());
         match self {
             Self::InvalidField(error) => {
-                details.add_bad_request_violation(&error.field, &error.description);
+                let description = shortened(&error.description);
+                details.add_bad_request_violation(shortened(&error.field), description);
             }
             Self::NotServed {
                 field,
@@ -206,7 +207,7 @@ impl ServiceError {
                 served,
             } => {
                 let description = format!("there is no {what} {name:?}; served: {served}");
-                details.add_bad_request_violation(*field, description);
+                details.add_bad_request_violation(*field, shortened(&description));
             }
             Self::Overloaded { retry, .. } => {
                 details.set_retry_info(Some(*retry));
@@ -225,9 +226,25 @@ impl From<ServiceError> for Status {
     fn from(error: ServiceError) -> Self {
         match error {
             ServiceError::Transport(status) => status,
-            error => Self::with_error_details(error.code(), error.to_string(), error.details()),
+            error => {
+                let message = shortened(&error.to_string());
+                Self::with_error_details(error.code(), message, error.details())
+            }
         }
     }
+}
+
+/// A text that may repeat what a client sent, cut so that the answer's headers stay within every client's limit.
+fn shortened(text: &str) -> String {
+    const LONGEST: usize = 1024;
+    if text.len() <= LONGEST {
+        return text.to_owned();
+    }
+    let mut end = LONGEST;
+    while !text.is_char_boundary(end) {
+        end -= 1;
+    }
+    format!("{}…", &text[..end])
 }
 
 #[cfg(test)]
@@ -248,6 +265,17 @@ mod tests {
         assert_eq!(info.metadata["field"], "pose.torso.x");
         let violations = &details.bad_request().expect("BadRequest").field_violations;
         assert_eq!(violations[0].field, "pose.torso.x");
+    }
+
+    #[test]
+    fn what_a_client_sent_is_not_repeated_at_length() {
+        let error = FieldError::new("config.robot", "ä".repeat(20_000));
+        let status = Status::from(ServiceError::from(error));
+        assert!(status.message().len() < 1100, "{}", status.message().len());
+        let details = status.get_error_details();
+        let violations = &details.bad_request().expect("BadRequest").field_violations;
+        assert!(violations[0].description.len() < 1100);
+        assert!(violations[0].description.ends_with('…'));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Measures a retargeter on sets of human motion: how close it points, how it moves in between, how fast it is.
 //!
-//! [`measures`] says how each figure is computed.
+//! The module `measures` says how each figure is computed.
 
 mod measures;
 

@@ -3,12 +3,11 @@
 #
 #   packaging/oci/build.sh PACKAGE.deb [FOLDER]      writes the image FOLDER:VERSION (default: target/packages/emp-server)
 #
-# Needs mmdebstrap and umoci. MIRROR and SUITE choose the Debian; where mirrors or their certificates are unusual, MMDEBSTRAP_OPTIONS
+# Needs mmdebstrap and umoci. MIRROR (without it mmdebstrap chooses) and SUITE choose the Debian; where mirrors or their certificates are unusual, MMDEBSTRAP_OPTIONS
 # is passed on. Copy the image into a registry with `skopeo copy oci:FOLDER:VERSION docker://…`.
 set -euo pipefail
 package=$(realpath "$1")
 image=$(realpath -m "${2:-target/packages/emp-server}")
-mirror=${MIRROR:-http://deb.debian.org/debian}
 suite=${SUITE:-bookworm}
 version=$(dpkg-deb -f "$package" Version)
 
@@ -17,7 +16,7 @@ trap 'rm -rf "$work"' EXIT
 # shellcheck disable=SC2086
 mmdebstrap --variant=essential --include="ca-certificates,$package" \
     --dpkgopt='path-exclude=/usr/share/man/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
-    ${MMDEBSTRAP_OPTIONS:-} "$suite" "$work/root.tar" "$mirror"
+    ${MMDEBSTRAP_OPTIONS:-} "$suite" "$work/root.tar" ${MIRROR:+"$MIRROR"}
 mkdir "$work/root"
 tar -C "$work/root" --exclude='./dev/*' -xf "$work/root.tar"
 
